@@ -7,6 +7,7 @@ own name, as a clone of its repository or as a copy of the files that are named 
 
 import argparse
 import os
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -268,10 +269,9 @@ def _told(
     commands = [command.replace("PART", (chosen or [one.example])[0]) for command in one.commands]
     if out is None:
         commands = [f"robocal data {name} --out OUT", *commands]
-    else:
-        if chosen:  # what is of others is not there
-            commands = [command for command in commands if _has_files(command, out)]
-        commands = [command.replace("OUT/", f"{out}/") for command in commands]
+    elif chosen:  # what is of others is not there
+        commands = [command for command in commands if _has_files(command, out)]
+    data = shlex.quote(str(folder)) if folder and out else here
     return {
         "name": name,
         "title": one.title,
@@ -283,11 +283,20 @@ def _told(
         "size": one.size,
         "found": folder is not None and folder.is_dir(),
         "get": [f"git clone {one.source} {here}", f"git -C {here} checkout {one.commit}"],
-        "commands": [
-            command.replace("DATA", str(folder) if folder and out else here)
-            for command in commands
-        ],
+        "commands": [_placed(command, out, data) for command in commands],
     }  # fmt: skip
+
+
+def _placed(command: str, out: Path | None, data: str) -> str:
+    """A command with its folders in place, as a shell takes them."""
+
+    def place(word: str) -> str:
+        if word == "DATA":
+            return data
+        own = out is not None and word.startswith("OUT/")
+        return shlex.quote(f"{out}/{word.removeprefix('OUT/')}") if own else word
+
+    return " ".join(map(place, command.split()))
 
 
 def _has_files(command: str, out: Path) -> bool:

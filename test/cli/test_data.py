@@ -96,9 +96,10 @@ def test_what_cannot_be_converted_is_said(
 def test_what_is_converted_does_what_is_told(name, data_dir: Path, tmp_path: Path):
     """Its commands run on what was written; what they find is held by tests of their own."""
     parts = {"ur10_tmac": ["--part", "D"]}.get(name, [])
-    document = run(name, data_dir, tmp_path / "out", *parts)
+    out = tmp_path / "my DATA"  # a word of the commands, and a blank
+    document = run(name, data_dir, out, *parts)
     files = {file for part in document["written"] for file in part["files"]}
-    there = {str(path) for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    there = {str(path) for path in out.rglob("*") if path.is_file()}
     assert files == there
     if parts:
         assert "D_train.csv" in document["sets"][0]["commands"][0]
