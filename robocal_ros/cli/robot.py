@@ -252,21 +252,15 @@ def _show_joint_functions(console: "Console", document: Document) -> None:
     for joint in document["joints"]:
         ends = (joint["from"], joint["to"])
         span = ["" if end is None else f"{end:.1f} {joint['unit']}" for end in ends]
-        small = "um" if joint["unit"] == "mm" else "urad"
-        numbers = [f"{joint[f'{name}_{small}']:.1f}" for name in ("rms", "largest")]
-        sigma = joint[f"sigma_{small}"]
-        numbers.append("" if sigma is None else f"{sigma:.1f}")
-        rows.append([joint["name"], *span, *numbers, f"{joint['compliance_micro']:.4f}"])
+        small, unit, load = "um", "µm", "N"
+        if joint["unit"] == "deg":
+            small, unit, load = "urad", "µrad", "(N m)"
+        sizes = [joint[f"{name}_{small}"] for name in ("rms", "largest", "sigma")]
+        numbers = ["" if size is None else f"{size:.1f} {unit}" for size in sizes]
+        compliance = f"{joint['compliance_micro']:.4f} {unit}/{load}"
+        rows.append([joint["name"], *span, *numbers, compliance])
     title = f"{document['robot']}: what joints turn besides what is read"
-    head = (
-        "joint",
-        "from",
-        "to",
-        "rms µrad",
-        "largest µrad",
-        "sigma µrad",
-        "compliance µrad/(N m)",
-    )
+    head = ("joint", "from", "to", "rms", "largest", "sigma", "compliance")
     print_table(console, title, head, rows)
     if document["masses"] == "found":
         print_words(console, FOUND_MASSES)

@@ -15,7 +15,7 @@ from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.arm import random_postures
 from robocal_ros.kinematics.joint_functions import IdentifiedFrom
-from robocal_ros.kinematics.robots import load_robot, save_robot
+from robocal_ros.kinematics.robots import load_description, load_robot, save_robot
 from robocal_ros.kinematics.tables import write_cells
 
 
@@ -199,3 +199,14 @@ def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert told["compliance_micro"] == pytest.approx(1e6 * arm.functions.compliance[2])
     assert main(plain) == 0
     assert "what joints turn besides what is read" in capsys.readouterr().out
+
+
+def test_joint_functions_have_the_unit_of_their_joint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "full.yaml"
+    save_robot(with_joint_errors(load_description("p1r2p3").arm, 2), path)
+    assert main(["joint-functions", "--robot", str(path)]) == 0
+    told = capsys.readouterr().out
+    assert told.count(" µm/N") == 2
+    assert told.count(" µrad/(N m)") == 1
