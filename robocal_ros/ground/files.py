@@ -261,8 +261,9 @@ class SoleUser:
             raise StorageError(
                 f"{path} cannot be locked: {error}: keep histories on a local disk, not on NFS"
             ) from error
-        os.ftruncate(self._file, 0)
-        os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
+        with contextlib.suppress(OSError):  # a full disk: it is held, by whom is not told
+            os.ftruncate(self._file, 0)
+            os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
 
     def _held(self) -> bool:
         try:

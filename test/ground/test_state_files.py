@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of a robot beside its history: whole, on the disk, and missed when it is gone."""
 
+import errno
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -8,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.ground.errors import StateLostError, StorageError
-from robocal_ros.ground.files import StateFile
+from robocal_ros.ground.errors import ConflictError, StateLostError, StorageError
+from robocal_ros.ground.files import SoleUser, StateFile
 
 
 @pytest.fixture
@@ -92,3 +93,17 @@ def test_a_number_that_is_not_finite_is_not_kept(history, bad):
     with pytest.raises(StorageError, match=r"state\.json: .*not JSON compliant"):
         keeper.save({"a": bad})
     assert keeper.load() == {"a": 1}
+
+
+def test_a_full_disk_keeps_no_node_from_its_part(history, monkeypatch):
+    """The file is there and locked; only the number of the process has no room in it."""
+
+    def full(*given: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", full)
+    holder = SoleUser(history, "maintenance_node", "K1", 0.0)
+    with pytest.raises(ConflictError, match=r"another maintenance_node \(process unknown\)"):
+        SoleUser(history, "maintenance_node", "K1", 0.0)
+    holder.close()
+    SoleUser(history, "maintenance_node", "K1", 0.0).close()
