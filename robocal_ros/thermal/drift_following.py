@@ -254,8 +254,11 @@ class DriftFollower:
     """
 
     def __init__(self, reference: ColdReference, expected: LearnedProcess, work: Work) -> None:
-        if reference.temperature is None:  # what the motors' warmth is against is not known
-            expected = replace(expected, gains=None)
+        if reference.temperature is None and expected.gains is not None:
+            # What the motors' warmth is against is not known: all that it may bring is expected.
+            whole = expected.tracker(reference.spots).expected_drift()
+            process = replace(expected.process, covariance=whole)
+            expected = replace(expected, process=process, gains=None)
         self._tracker = expected.tracker(reference.spots)
         self._reference, self._work = reference, work
         self._forecast: tuple[SerialArm, AccuracyForecast] | None = None

@@ -371,12 +371,13 @@ class Beside:
 
     ``fixed`` (n, 3): centres of a sphere fixed in the cell, m; ``temperatures``: stamps and
     temperatures (n,) of all motors since the last cycle, degrees Celsius; ``temperature`` (n,):
-    those of that time, None where they are not known.
+    those of that time, None where they are not known; ``silent``: joints of which none is.
     """
 
     fixed: Array
     temperatures: Sequence[tuple[int, Array]]
     temperature: Array | None
+    silent: tuple[str, ...]
 
 
 class Windows:
@@ -545,6 +546,17 @@ class MotorTemperatures:
         """Temperatures (n,) at a stamp; None where they are not known."""
         found = self.between(stamp_ns - SILENT_NS, stamp_ns)
         return found[-1][1] if found else None
+
+    def silent(self, stamp_ns: int) -> tuple[str, ...]:
+        """Joints of which no temperature is known at a stamp."""
+        after_ns = stamp_ns - SILENT_NS
+        read = {
+            joint
+            for ten in range(after_ns // EVERY_NS, stamp_ns // EVERY_NS + 1)
+            for joint, sample in self._kept.get(ten, {}).items()
+            if after_ns < sample.stamp_ns <= stamp_ns
+        }
+        return tuple(name for name, joint in self._place.items() if joint not in read)
 
 
 # ---- what the sensor of a measuring robot sees, in base: by the model in force -------------------

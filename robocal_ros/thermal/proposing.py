@@ -278,6 +278,8 @@ class Proposer:
             )
         command, expected, from_what = self._expected(command)
         message += str(command.arguments.get(LEFT_OUT, "")) + which_arm + from_what
+        if expected["gains"] is not None and beside.temperature is None:
+            message += f", followed without: no temperature of {', '.join(beside.silent)}"
         if words := other_sides(reference.spots, reference.data):
             message += f"; {words}"
         document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}

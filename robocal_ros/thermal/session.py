@@ -228,7 +228,8 @@ class ThermalSession(SessionBase):
         readings = self.temperatures.between(after_ns, until_ns)
         if self.config.arrangement == FLANGE:  # all spheres are fixed, and targets
             fixed = fixed[:0]
-        return Beside(fixed, readings, self.temperatures.at(until_ns))
+        motors = self.temperatures
+        return Beside(fixed, readings, motors.at(until_ns), motors.silent(until_ns))
 
     def _close_cycle(self, command: Command) -> None:
         self.cycle.id = ""

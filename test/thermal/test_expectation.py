@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from shift import NOISE_M, NS, DriftingRobot, warmed
 
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import TemperatureSample
 from robocal_ros.session import events
 from robocal_ros.session.events import Outcome
@@ -29,6 +30,7 @@ class Robot(DriftingRobot):
 
     def __init__(self, folder: Path, *, prior: str = "default", temperatures: bool = False) -> None:
         self.temperatures = temperatures
+        self.silent: tuple[str, ...] = ()
         super().__init__(folder, config(prior), POSES)
 
     def start(self, prior: str | None = None) -> ThermalSession:
@@ -36,11 +38,12 @@ class Robot(DriftingRobot):
         return super().start()
 
     def warmth(self, kelvin: float) -> None:
-        """All motors are read."""
+        """All motors are read but those that are silent."""
         if self.temperatures:
             for name in self.nominal.joint_names:
                 at = self.shift.now_ns
-                self.session.add(TemperatureSample(at, name, COLD_C + kelvin))
+                if name not in self.silent:
+                    self.session.add(TemperatureSample(at, name, COLD_C + kelvin))
 
     def visit(self, command: str, kelvin: float, after_h: float) -> Outcome:
         self.shift.now_ns += round(after_h * 3600 * NS)
@@ -103,6 +106,23 @@ def learned(tmp_path_factory) -> Robot:
         robot.work(highest)
     robot.start("learned")
     return robot
+
+
+def test_a_motor_that_was_not_read_when_cold_hides_no_drift(learned):
+    """Its warmth cannot be told from then on: what it brings is expected, and no step."""
+    silent = learned.nominal.joint_names[2]
+    learned.silent = (silent,)
+    try:
+        captured = learned.visit(events.CAPTURE_REFERENCE, 0.0, 12.0)
+        default = np.trace(drift_prior(learned.nominal))
+        assert np.trace(learned.session.expected_drift()) > 0.1 * default
+        found = learned.visit(events.IDENTIFY, 15.0, 2.0)
+    finally:
+        learned.silent = ()
+        again = learned.visit(events.CAPTURE_REFERENCE, 0.0, 12.0)
+    assert captured.message.endswith(f"3 shifts, followed without: no temperature of {silent}")
+    assert found.status is not Code.SENSOR_OR_ROBOT_MOVED, found.message
+    assert "followed without" not in again.message
 
 
 def test_temperatures_tell_the_drift_between_cycles(learned):
