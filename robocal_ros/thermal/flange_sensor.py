@@ -253,10 +253,10 @@ class FlangeSensorIdentification:
         spread = self.estimate.covariance[:count, :count]
         return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, spread, rows))))
 
-    def workspace_change(self) -> float:
-        """Rms displacement, m, of the same point by the identified parameters."""
+    def workspace_change(self, arm: SerialArm) -> float:
+        """Rms displacement, m, of the same point from ``arm``'s parameters to the identified."""
         chosen = self.nominal.parameters
-        moved = self._workspace_rows() @ chosen.read(self.cell.arm.mdh - self.nominal.mdh)
+        moved = self._workspace_rows() @ chosen.read(self.cell.arm.mdh - arm.mdh)
         return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
     def _workspace_rows(self) -> Array:
@@ -337,7 +337,7 @@ class JudgedFlangeSensor(Judgement):
     """An identified measuring robot with its judgement.
 
     Errors are distances of each measured centre, in base, from its sphere's mean over the session.
-    The nominal model, with a hand-eye pose of its own, is the one in force.
+    Each model has a hand-eye pose of its own, from the same sessions.
     """
 
     identification: FlangeSensorIdentification
@@ -350,10 +350,12 @@ def identify_and_judge_flange_sensor(
     *,
     share: float = 0.5,
     seed: int = 0,
+    in_force: SerialArm | None = None,
 ) -> JudgedFlangeSensor:
     """Identify from sessions and judge on ``check``, in which only the centres are refitted.
 
     Without ``check`` a ``share`` of the poses of the sessions is held out.
+    ``in_force``: arm with the parameters in force, default the nominal ``arm``.
     """
     train = in_sessions(sessions)
     if check is None:
@@ -361,21 +363,21 @@ def identify_and_judge_flange_sensor(
         train, check = train.take(~held), train.take(held)
     result = identify_flange_sensor(arm, train)
     plain = identify_flange_sensor(arm, train, geometry=False)
-    before = np.linalg.norm(plain.cell.scatter(check), axis=1)
+    was = plain if in_force is None else identify_flange_sensor(in_force, train, geometry=False)
+    before = np.linalg.norm(was.cell.scatter(check), axis=1)
     after = np.linalg.norm(result.cell.scatter(check), axis=1)
     sound = ~gross(before, after)
     model = float(result.predicted_variance(check).mean())
     noise = result.noise_m if check.sigma is None else float(np.sqrt(np.mean(check.sigma**2)))
-    plain_error = summarise(before[sound])
-    workspace_rms_m, change_m = result.workspace_rms(), result.workspace_change()
+    current = summarise(before[sound])
+    workspace_rms_m = result.workspace_rms()
+    change_m = result.workspace_change(in_force or arm)
     remedy = "look at the spheres from more sides, and turn every joint"
-    doubt = result.estimate.creeping or too_narrow(
-        workspace_rms_m, change_m, plain_error.rms_m, remedy
-    )
+    doubt = result.estimate.creeping or too_narrow(workspace_rms_m, change_m, current.rms_m, remedy)
     return JudgedFlangeSensor(
         identification=result,
-        nominal=plain_error,
-        current=plain_error,
+        nominal=summarise(plain.cell.scatter(check)[sound]),
+        current=current,
         candidate=summarise(after[sound]),
         predicted_rms_m=float(np.sqrt(model)),
         predicted_total_rms_m=float(np.sqrt(model + 3.0 * noise**2)),

@@ -153,9 +153,14 @@ class Proposer:
         """
         current, reference = self._current, self._current.reference
         if reference is None or follower is None:
+            in_force = current.arm if current.head.model is not None else None
             if self._config.arrangement == FLANGE:
                 judged = identify_and_judge_flange_sensor(
-                    self._nominal, [data], share=self._config.hold_out, seed=self._config.seed
+                    self._nominal,
+                    [data],
+                    share=self._config.hold_out,
+                    seed=self._config.seed,
+                    in_force=in_force,
                 )
                 document = flange_sensor_document(judged)
                 model = flange_sensor_model(judged.identification)
@@ -168,7 +173,7 @@ class Proposer:
                 seed=self._config.seed,
                 method=method,
                 model="full",
-                in_force=current.arm if current.head.model is not None else None,
+                in_force=in_force,
             )
             model = identified_model_document(found.identification)
             document = {**identification_document(found)}
