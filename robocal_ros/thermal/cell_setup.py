@@ -231,6 +231,26 @@ def read_sensor(path: Path, arm: SerialArm) -> PlacedSensor:
     return placed_of(top.values)
 
 
+def placed_spots(arm: SerialArm, path: Path, cold: Measurements) -> ColdSpots:
+    """Each pose of a cold visit once, as a sensor file places sensor and sphere.
+
+    Raises as `read_sensor`; `ResidualError` when half of the poses lie further off than any robot's
+    static error: a drift would be told in the axes of a sensor that stands elsewhere.
+    """
+    sensor = read_sensor(path, arm)
+    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
+    spots = ColdSpots.of(CellModel(arm, sensor.T_sensor_base, cold.targets, tool), cold)
+    off_m = float(np.median(np.linalg.norm(spots.error, axis=1)))  # a wrong visit does no harm
+    if off_m > LARGEST_RMS_M:
+        raise ResidualError(
+            f"the cold visits lie {off_m * 1e3:.1f} mm from where {path} places them, in the "
+            f"median, more than any robot's static error ({LARGEST_RMS_M * 1e3:.0f} mm): calibrate "
+            "the sensor anew where it, the sphere or the base was moved since; else check robot "
+            "file and units"
+        )
+    return spots
+
+
 def sensor_document(found: SensorCalibration, arm: SerialArm) -> "PlacedSensorDocument":
     """A placed sensor: where, how well, and whether to trust it.
 

@@ -33,7 +33,6 @@ from robocal_ros.ground.files import write_text
 from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.ground.samples import JOINTS, JointStream, joint_sample
 from robocal_ros.history.history_records import REFERENCE
-from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import random_postures
 from robocal_ros.kinematics.robots import read_fields, read_pose
@@ -41,9 +40,9 @@ from robocal_ros.kinematics.tables import read_measurements, stamp_texts, texts,
 from robocal_ros.report.figures import draw_rounds
 from robocal_ros.thermal.accuracy import learn_drift, read_prior, write_prior
 from robocal_ros.thermal.cell_setup import (
-    PlacedSensor,
     SensorField,
     calibrate_sensor,
+    placed_spots,
     plan_cycle,
     read_sensor,
     sensor_document,
@@ -234,10 +233,9 @@ def run_learn_prior(args: argparse.Namespace) -> CliResult:
         )
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
-    sensor = read_sensor(args.sensor, arm)
     histories = []
     for cold_file, warm_file in zip(args.cold, args.warm, strict=True):
-        cold, spots = cold_spots(arm, sensor, cold_file)
+        cold, spots = cold_spots(arm, args.sensor, cold_file)
         warm = warm_visits(warm_file, arm, cold)
         histories.append((spots, [warm.of_cycle(name).data for name in warm.cycles]))
     covariance = learn_drift(histories, sigma_m=args.sigma_mm * 1e-3)
@@ -269,8 +267,7 @@ def identify_fixed_files(arm: SerialArm, args: argparse.Namespace) -> Document:
     """Identify each cycle of the warm table; the document is the last one's."""
     chosen = tuple(name.strip() for name in (args.parameters or "").split(",") if name.strip())
     sigma_m = args.sigma_mm * 1e-3
-    sensor = read_sensor(args.sensor, arm)
-    cold, spots = cold_spots(arm, sensor, args.cold)
+    cold, spots = cold_spots(arm, args.sensor, args.cold)
     warm = warm_visits(args.warm, arm, cold)
     check = None if args.check is None else check_visits(args.check, arm, cold, warm)
     prior = drift_prior(arm) if args.prior is None else read_prior(args.prior, arm)
@@ -306,7 +303,7 @@ def _name(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def cold_spots(arm: SerialArm, sensor: PlacedSensor, path: Path) -> tuple[Visits, ColdSpots]:
+def cold_spots(arm: SerialArm, sensor: Path, path: Path) -> tuple[Visits, ColdSpots]:
     """Read a table of cold visits and average those of each pose."""
     cold = read_visits(path, arm)
     targets = cold.data.targets
@@ -316,9 +313,7 @@ def cold_spots(arm: SerialArm, sensor: PlacedSensor, path: Path) -> tuple[Visits
             file=str(path),
             column="target",
         )
-    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
-    cell = CellModel(arm, sensor.T_sensor_base, targets, tool)
-    return cold, ColdSpots.of(cell, cold.data)
+    return cold, placed_spots(arm, sensor, cold.data)
 
 
 def warm_visits(path: Path, arm: SerialArm, cold: Visits) -> Visits:
@@ -531,7 +526,7 @@ def run_screen(args: argparse.Namespace) -> CliResult:
 
 
 def _history(args: argparse.Namespace, arm: SerialArm) -> DriftHistory:
-    cold, spots = cold_spots(arm, read_sensor(args.sensor, arm), args.cold)
+    cold, spots = cold_spots(arm, args.sensor, args.cold)
     warm = warm_visits(args.warm, arm, cold)
     check = check_visits(args.check, arm, cold, warm)
     shared = [name for name in warm.cycles if name in check.cycles]

@@ -160,6 +160,20 @@ def test_a_sensor_of_another_robot_is_refused(folder):
     assert fixed(folder, sensor=other.name, status=2)["error"]["code"] == "WRONG_ROBOT"
 
 
+def test_a_sensor_file_of_another_placement_is_refused(folder):
+    """The sensor stands turned by 15 deg since: cold and warm would agree, the drift turned too."""
+    kept = yaml.safe_load((folder / "s.yaml").read_text())
+    pose = kept["T_sensor_base"]
+    turn = frames.transform(frames.exp_rotation([0.0, 0.0, np.radians(15.0)]), np.zeros(3))
+    moved = frames.transform_from_quat(np.array(pose["xyz_mm"]) * 1e-3, pose["quat_xyzw"]) @ turn
+    kept["T_sensor_base"] = frames.transform_document(moved)
+    (folder / "turned.yaml").write_text(yaml.safe_dump(kept))
+    error = fixed(folder, "--check", folder / "check.csv", sensor="turned.yaml", status=3)["error"]
+    assert error["code"] == "RESIDUAL_TOO_LARGE"
+    assert str(folder / "turned.yaml") in error["message"]
+    assert "calibrate the sensor anew" in error["message"]
+
+
 def test_people_get_the_verdict_first(folder):
     words = ["--robot", ROBOT, "--sensor", folder / "s.yaml", "--cold", folder / "cold.csv"]
     done = robocal("thermal", "identify", *words, "--warm", folder / "warm.csv")
