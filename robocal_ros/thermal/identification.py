@@ -557,7 +557,7 @@ def conclude(
         predicted_total_rms_m=float(np.sqrt(np.mean(spread[sound] ** 2))),
         workspace_rms_m=workspace_rms_m,
         held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
-        verdict=judge(current[sound], after[sound], spot[sound], doubt),
+        verdict=judge(current[sound], after[sound], spots.pose[spot][sound], doubt),
     )
 
 

@@ -78,7 +78,7 @@ class ColdSpots:
         return np.asarray(np.min(away, axis=1) < SAME_VISIT_RAD)
 
     @cached_property
-    def _pose(self) -> Index:
+    def pose(self) -> Index:
         """Number (s,) of each spot's pose, from 1 in the order of the cold visit."""
         group = pose_groups(self.q)
         first = [int(self.first[group == g].min()) for g in range(int(group.max()) + 1)]
@@ -87,7 +87,7 @@ class ColdSpots:
     @property
     def poses(self) -> int:
         """How many poses were visited cold."""
-        return int(self._pose.max())
+        return int(self.pose.max())
 
     def visited(self, q: Array) -> tuple[int, ...]:
         """Numbers of the cold poses, from 1 in their order, that joint readings (m, n) are at."""
@@ -95,7 +95,7 @@ class ColdSpots:
             return ()
         away = np.max(np.abs(q[:, None] - self.q), axis=2)
         near = np.argmin(away, axis=1)[np.min(away, axis=1) < SAME_VISIT_RAD]
-        return tuple(np.unique(self._pose[near]).tolist())
+        return tuple(np.unique(self.pose[near]).tolist())
 
     def common(self, warm: Measurements) -> Measurements:
         """Those of the measurements that `match` finds a spot for."""

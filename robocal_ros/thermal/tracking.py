@@ -447,7 +447,7 @@ def track_cycle(
     """
     spots = tracker.spots
     warm = spots.average(warm, tracker.sigma_m)
-    if len(warm) < FEWEST_POSES:
+    if len(spots.visited(warm.q)) < FEWEST_POSES:
         raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
     last = tracker.state
     innovation = tracker.take(warm, time_s, doubt_s)
@@ -529,11 +529,10 @@ def _left_out(
     D = tracker.drift_rows(before.time_s)
     v, S, k, count = innovation.deviation, innovation.covariance, tracker.count, len(warm)
     forecast, PH = D @ before.mean, D @ before.covariance @ H.T
-    kept = np.repeat(innovation.kept, 3)
+    kept, pose = np.repeat(innovation.kept, 3), tracker.spots.pose[tracker.spots.match(warm)]
     miss, spread, drifts = np.empty((count, 3)), np.empty(count), np.empty((count, k))
     for i in range(count):
-        own, others = slice(3 * i, 3 * i + 3), kept.copy()
-        others[own] = False
+        own, others = slice(3 * i, 3 * i + 3), kept & np.repeat(pose != pose[i], 3)
         across = S[others, own]
         gain = np.linalg.solve(S[np.ix_(others, others)], np.column_stack([v[others], across]))
         miss[i] = v[own] - across.T @ gain[:, 0]

@@ -58,6 +58,17 @@ def test_a_drift_is_found_where_the_sensor_looks(captured):
     assert np.mean(left < bound) >= 0.95
 
 
+def test_spheres_seen_from_one_pose_judge_as_one(captured):
+    """Two spheres from three poses: three visits, each as far off as the robot repeats."""
+    hot = warmed(captured.cold)
+    captured.feed(captured.shift.visit(hot, captured.q[:3], 2.0))
+    few = captured.ask(events.IDENTIFY)
+    assert few.status is Code.TOO_FEW_SAMPLES
+    assert "3 held-out poses cannot judge" in few.message
+    captured.feed(captured.shift.visit(hot, captured.q[:1]))
+    assert "one pose cannot show a drift" in captured.ask(events.IDENTIFY).message
+
+
 def test_a_session_that_starts_anew_goes_on_bit_for_bit(captured):
     first = cycle(captured, 8.0)
     assert first.status is Code.ACCEPT, first.message

@@ -10,6 +10,7 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.identification import (
     FixedSphere,
@@ -172,6 +173,30 @@ def test_leaving_a_pose_out_is_taking_the_cycle_without_it(arm):
         assert whole.found.left_out[spots.match(warm)[i]] == pytest.approx(
             y - H @ part.state.mean, abs=1e-12
         )
+
+
+def test_leaving_a_pose_out_leaves_out_all_that_was_seen_there(arm):
+    """Two targets on the flange, measured at each pose: they share its repeatability."""
+    rng, q = np.random.default_rng(8), np.repeat(postures(POSES), 2, axis=0)
+    cell, names, target = cell_of(arm), ("ball", "tip"), np.tile([0, 1], POSES)
+    places = np.repeat(cell.T_flange_target, 2, axis=0)
+    places[1, 0, 3] += 0.1
+    cell = replace(cell, targets=names, T_flange_target=places)
+
+    def both(seen: CellModel) -> Measurements:
+        p = seen.predict(q, target)[:, :3, 3]
+        p = p + SIGMA * rng.standard_normal(p.shape)
+        return Measurements(q, p, names * POSES, tuple(map(str, range(len(q)))))
+
+    spots, process = ColdSpots.of(cell, both(cell)), DriftProcess(drift_prior(arm))
+    warm = both(drifted(cell, 0.3 * np.sqrt(np.diag(drift_prior(arm)))))
+    whole = track_cycle(DriftTracker(spots, process, SIGMA), warm, 7200.0, in_force=arm)
+    for i in range(POSES):
+        own, part = np.arange(len(q)) // 2 == i, DriftTracker(spots, process, SIGMA)
+        part.take(warm.take(~own), 7200.0)
+        y, H, _ = part.observation(warm.take(own), 7200.0)
+        miss = (y - H @ part.state.mean).reshape(2, 3)
+        assert whole.found.left_out[spots.match(warm)[own]] == pytest.approx(miss, abs=1e-12)
 
 
 def test_the_model_in_force_is_judged_at_the_same_poses_by_its_drift_alone(arm):
