@@ -269,7 +269,9 @@ def identify_fixed_files(arm: SerialArm, args: argparse.Namespace) -> Document:
     sigma_m = args.sigma_mm * 1e-3
     cold, spots = cold_spots(arm, args.sensor, args.cold)
     warm = warm_visits(args.warm, arm, cold)
-    check = None if args.check is None else check_visits(args.check, arm, cold, warm)
+    check = None
+    if args.check is not None:
+        check = check_visits(args.check, arm, cold, warm, only=warm.cycles[-1])
     prior = drift_prior(arm) if args.prior is None else read_prior(args.prior, arm)
     documents = []
     for name in warm.cycles:
@@ -279,10 +281,8 @@ def identify_fixed_files(arm: SerialArm, args: argparse.Namespace) -> Document:
         else:
             found = identify_cycle(spots, data, prior_covariance=prior, sigma_m=sigma_m)
         unseen = None
-        if check is not None:  # visits without a cycle belong to the last one
-            last = check.cycles == (ONLY_CYCLE,) and name == warm.cycles[-1]
-            own = check if last else check.of_cycle(name)
-            unseen = own.data if len(own.data) else None
+        if check is not None and name in check.cycles:
+            unseen = check.of_cycle(name).data
         judged = judge_cycle(found, spots, in_force=arm, check=unseen, sigma_m=sigma_m)
         method = "subset" if chosen else "map"
         documents.append(cycle_document(found, judged, spots, arm, method) | {"cycle": name})
@@ -316,16 +316,18 @@ def cold_spots(arm: SerialArm, sensor: Path, path: Path) -> tuple[Visits, ColdSp
     return cold, placed_spots(arm, sensor, cold.data)
 
 
-def warm_visits(path: Path, arm: SerialArm, cold: Visits) -> Visits:
+def warm_visits(path: Path, arm: SerialArm, cold: Visits, only: str = ONLY_CYCLE) -> Visits:
     """Read a table of warm visits of poses that were visited cold."""
-    warm = read_visits(path, arm)
+    warm = read_visits(path, arm, only)
     require_cold_counterparts(cold, warm, str(path))
     return warm
 
 
-def check_visits(path: Path, arm: SerialArm, cold: Visits, warm: Visits) -> Visits:
+def check_visits(
+    path: Path, arm: SerialArm, cold: Visits, warm: Visits, only: str = ONLY_CYCLE
+) -> Visits:
     """Read a table of warm visits of poses that are not in the warm table."""
-    check = warm_visits(path, arm, cold)
+    check = warm_visits(path, arm, cold, only)
     shared = sorted(set(check.pose) & set(warm.pose))
     if shared:
         raise InputError(

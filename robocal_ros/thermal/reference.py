@@ -407,7 +407,7 @@ class Visits:
     """Measurements at named poses.
 
     ``pose`` (m,): name of the pose, which cold and warm visits share.
-    ``cycle`` (m,): name of the cycle; all ``ONLY_CYCLE`` where none is given.
+    ``cycle`` (m,): name of the cycle; that of `read_visits` where the table has none.
     """
 
     data: Measurements
@@ -460,8 +460,10 @@ def require_cold_counterparts(cold: Visits, warm: Visits, file: str | None = Non
             )
 
 
-def read_visits(path: str | Path, arm: SerialArm) -> Visits:
+def read_visits(path: str | Path, arm: SerialArm, only: str = ONLY_CYCLE) -> Visits:
     """Read a table of visits of named poses: as ``read_measurements``, with a column ``pose``.
+
+    ``only``: name of the cycle where the table has no column ``cycle``.
 
     Raises `InputError` as ``read_measurements``, and when the column ``pose`` is missing.
     """
@@ -473,7 +475,7 @@ def read_visits(path: str | Path, arm: SerialArm) -> Visits:
             row=1,
         )
     data = measurements_of(table, layout, arm)
-    cycle = table.words("cycle") or (ONLY_CYCLE,) * len(data)
+    cycle = table.words("cycle") or (only,) * len(data)
     return Visits(data, table.words("pose"), cycle)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import yaml
 from command import robocal, robocal_json
-from drift_tables import ROBOT, SIGMA, fixed_tables, session
+from drift_cell import postures
+from drift_tables import ROBOT, SIGMA, drifted, fixed_tables, session, visits
 
 from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
@@ -75,6 +76,21 @@ def test_a_drift_is_found_and_judged_at_unseen_poses(folder):
 def test_without_check_each_pose_is_judged_by_the_others(folder):
     document = fixed(folder)
     assert document["calibrated"]["held_out"]["n"] == 6
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_check_visits_judge_the_cycle_that_they_name_else_the_last(folder, named):
+    """Also where its name is a number; a cycle without check visits is judged by its own poses."""
+    q, cycles = postures(20), {"1": drifted(1.0), "2": drifted(2.0)}
+    visits(folder / "numbered.csv", cycles, {f"p{i}": q[i] for i in range(6)}, 7)
+    own, unseen = "1" if named else "2", {f"c{i}": q[i] for i in range(6, 20)}
+    check = visits(folder / f"check_{own}.csv", {own: cycles[own]}, unseen, 8)
+    if not named:
+        rows = [line.split(",") for line in check.read_text().splitlines()]
+        check.write_text("".join(",".join([pose, *rest]) + "\n" for pose, _, *rest in rows))
+    document = fixed(folder, "--check", check, warm="numbered.csv")
+    judges = {one["cycle"]: one["calibrated"]["held_out"]["n"] for one in document["cycles"]}
+    assert judges == ({"1": 14, "2": 6} if named else {"1": 6, "2": 14})
 
 
 def test_a_subset_holds_the_rest(folder):
