@@ -49,7 +49,7 @@ EVERY_NS = 10_000_000_000  # of a motor's temperatures within ten seconds the fi
 SILENT_NS = 900_000_000_000  # a temperature says nothing any more after a quarter of an hour
 MOST_INTERVALS = 20_000  # of those ten seconds: more than two days
 TIME_OUT = "time-out"
-OTHER_POSE = "measured at a pose that the cold reference lacks"
+OTHER_POSE = "measured at a pose where the cold reference lacks it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -449,13 +449,15 @@ class Windows:
         sigma_m = None  # a calibration finds its noise itself
         if reference is not None and not sets_up:
             sigma_m = self._config.sigma_m
-            known = reference.spots.knows(np.array([o.q for o in found]))
+            targets = [o.sample.target for o in found]
+            known = reference.knows(np.array([o.q for o in found]), targets)
             for other in (o for o, at_one in zip(found, known, strict=True) if not at_one):
                 desk.ignored.add(other.sample.topic, OTHER_POSE)
             if not np.any(known):
                 raise InputError(
-                    f"none of the {len(found)} measured poses was measured in the cold reference: "
-                    "visit the reference poses, or capture a new reference"
+                    f"none of the {len(found)} measured poses of {', '.join(sorted(set(targets)))} "
+                    "was measured in the cold reference: visit the reference poses, or capture a "
+                    "new reference"
                 )
             found = [o for o, at_one in zip(found, known, strict=True) if at_one]
         last = int(command.arguments.get("samples", 0))

@@ -72,11 +72,6 @@ class ColdSpots:
         side = None if data.side is None else mean @ data.side
         return cls(cell, q, target[first], static, visits, first, rejected, on_flange, side)
 
-    def knows(self, q: Array) -> NDArray[np.bool_]:
-        """Which joint readings (m, n) are those of a cold visit: all joints within 0.5 deg."""
-        away = np.max(np.abs(q[:, None] - self.q), axis=2)
-        return np.asarray(np.min(away, axis=1) < SAME_VISIT_RAD)
-
     @cached_property
     def pose(self) -> Index:
         """Number (s,) of each spot's pose, from 1 in the order of the cold visit."""
@@ -99,9 +94,12 @@ class ColdSpots:
 
     def common(self, warm: Measurements) -> Measurements:
         """Those of the measurements that `match` finds a spot for."""
-        away = np.max(np.abs(warm.q[:, None] - self.q), axis=2)
-        same = np.array(warm.target)[:, None] == np.array(self.cell.targets)[self.target]
-        return warm.take(np.any(same & (away < SAME_VISIT_RAD), axis=1))
+        return warm.take(_again(warm.q, warm.target, self.q, self.names))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name (s) of each spot's target."""
+        return tuple(self.cell.targets[i] for i in self.target)
 
     def match(self, warm: Measurements) -> Index:
         """The spot (m,) that each warm measurement visits again: all joints within 0.5 deg.
@@ -191,6 +189,15 @@ class ColdSpots:
         return J, np.concatenate([np.broadcast_to(np.eye(3), own.shape), own], axis=2)
 
 
+def _again(
+    q: Array, target: Sequence[str], spot_q: Array, spot_target: Sequence[str]
+) -> NDArray[np.bool_]:
+    """Which targets (m) at joints (m, n) are spots (s) again: all joints within 0.5 deg."""
+    away = np.max(np.abs(q[:, None] - spot_q), axis=2)
+    same = np.array(target, dtype=np.str_)[:, None] == np.array(spot_target, dtype=np.str_)
+    return np.asarray(np.any(same & (away < SAME_VISIT_RAD), axis=1))
+
+
 @dataclass(frozen=True, eq=False)
 class SpheresInCell:
     """What the sensor of a measuring robot saw of spheres that are fixed in the cell, when cold.
@@ -270,6 +277,13 @@ class ColdReference:
     def placed(self, data: Measurements) -> Measurements:
         """Measurements as places of the cell's targets: they are, but of a measuring robot."""
         return data if self.spheres is None else self.spheres.placed(self.cell, data)
+
+    def knows(self, q: Array, target: Sequence[str]) -> NDArray[np.bool_]:
+        """Which targets (m), as the sensor names them, were measured cold at joints (m, n)."""
+        spots, spheres = self.spots, self.spheres
+        if spheres is not None:
+            return _again(q, target, spheres.q, spheres.sphere)
+        return _again(q, target, spots.q, spots.names)
 
     @property
     def used(self) -> Measurements:
@@ -540,7 +554,7 @@ def drift_share(
     used = visit.used
     if visit.spheres is not None and reference.spheres is not None:
         seen = visit.spheres.seen(visit.cell, used)
-        used = reference.placed(seen.take(spots.knows(seen.q)))
+        used = reference.placed(seen.take(reference.knows(seen.q, seen.target)))
     again = spots.common(used)
     again = again.take(~np.isin(again.sample, visit.spots.rejected))
     if len(spots.visited(again.q)) < FEWEST_GROUPS:

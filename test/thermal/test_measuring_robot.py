@@ -58,6 +58,24 @@ def test_a_drift_is_found_where_the_sensor_looks(captured):
     assert np.mean(left < bound) >= 0.95
 
 
+def test_a_sphere_hidden_at_a_pose_when_cold_is_left_out_there(tmp_path):
+    """Of a cycle, and where a new cold reference is compared with the old one."""
+    robot = DriftingRobot(tmp_path, CONFIG)
+    robot.shift, robot.q = MeasuringShift(robot.nominal.joint_names), looking(POSES)
+    samples = list(robot.shift.visit(robot.cold, np.tile(robot.q, (ROUNDS, 1))))
+    hidden = [s for s in samples if getattr(s, "target", "") == "b"][5::POSES]
+    robot.feed(s for s in samples if not any(s is one for one in hidden))
+    assert robot.ask(events.CAPTURE_REFERENCE).status is Code.ACCEPT
+    outcome = cycle(robot, 15.0)
+    assert (outcome.status, outcome.samples) == (Code.ACCEPT, 2 * POSES - 1), outcome.message
+    assert sum(c.total() for c in robot.session.desk.ignored.values()) == 1
+    assert robot.ask(events.ACCEPT, id=outcome.calibration_id).done
+    robot.feed(robot.shift.visit(robot.cold, np.tile(robot.q, (ROUNDS, 1)), 12.0))
+    again = robot.ask(events.CAPTURE_REFERENCE)
+    assert again.status is Code.ACCEPT, again.message
+    assert "the robot is cold" in again.message
+
+
 def test_spheres_seen_from_one_pose_judge_as_one(captured):
     """Two spheres from three poses: three visits, each as far off as the robot repeats."""
     hot = warmed(captured.cold)
