@@ -61,8 +61,10 @@ class ColdSpots:
         median = np.array([np.median(error[spot == s], axis=0) for s in range(len(count))])
         away = np.linalg.norm(error - median[spot], axis=1)
         judged, keep = count[spot] >= FEWEST_TO_JUDGE, np.ones(len(error), dtype=np.bool_)
-        if np.any(judged):
-            keep = ~judged | (away <= CONTRADICTION * np.median(away[judged]))
+        if np.any(judged):  # of visits that all contradict each other the nearer half is kept
+            own = np.array([np.median(away[spot == s]) for s in range(len(count))])[spot]
+            far = np.maximum(CONTRADICTION * np.median(away[judged]), own)
+            keep = ~judged | (away <= far)
         visits = np.bincount(spot[keep])
         mean = np.zeros((len(visits), len(data)))
         mean[spot[keep], np.flatnonzero(keep)] = 1.0 / visits[spot[keep]]
