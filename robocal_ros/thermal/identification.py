@@ -407,14 +407,14 @@ def possible_causes(
                 by += f" and {np.degrees(np.linalg.norm(moved[3:])):.3f} deg"
             found.append(Cause(name, f"{words} by {by}"))
     arm = spots.cell.arm
-    names = arm.parameters.names
+    names, to_display = arm.parameters.names, arm.parameters.to_display
     for i, joint in enumerate(arm.joint_names, start=1):
-        zero = f"d{i}_mm" if arm.prismatic[i - 1] else f"theta{i}_deg"
-        if zero not in names:
+        kind, unit = ("d", "mm") if arm.prismatic[i - 1] else ("theta", "deg")
+        if (zero := f"{kind}{i}_{unit}") not in names:
             continue
-        column = parameters[:, :, [names.index(zero)]]
-        if (moved := _explains(column, deviation, covariance)) is not None:
-            by = f"{np.degrees(moved[0]):.4f} deg"
+        place = names.index(zero)
+        if (moved := _explains(parameters[:, :, [place]], deviation, covariance)) is not None:
+            by = f"{to_display[place] * moved[0]:.4f} {unit}"
             found.append(Cause(joint, f"the zero of {joint} changed by {by}"))
     return tuple(found)
 

@@ -12,6 +12,8 @@ from robocal_ros.ground.errors import Code, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import random_postures
+from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import (
     FixedSphere,
     drift_prior,
@@ -81,6 +83,17 @@ def test_the_size_of_a_knock_is_told(arm, what):
     words = take(settled(arm, 2), knocked(arm, what)).judged.verdict.reason
     size = {"sensor": "moved against each other by", "sphere": "moved on the flange by 1.0"}[what]
     assert size in words
+
+
+def test_the_zero_of_a_sliding_joint_is_told_in_millimetres():
+    arm = load_robot("p1r2p3")
+    cell, q = cell_of(arm), random_postures(arm, POSES)
+    warm = visit(cell, q)
+    spots = ColdSpots.of(cell, warm)
+    rows, _ = spots.rows(q, np.zeros(POSES, dtype=np.int64))
+    moved = 5e-4 * rows[:, :, arm.parameters.names.index("d3_mm")]
+    causes = possible_causes(spots, warm, moved.ravel(), 1e-10 * np.eye(3 * POSES))
+    assert "the zero of joint3 changed by 0.5000 mm" in {cause.words for cause in causes}
 
 
 def test_what_would_decide_is_said_only_where_it_would(arm):
