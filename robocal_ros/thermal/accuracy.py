@@ -374,6 +374,7 @@ def read_prior(path: Path, arm: SerialArm) -> Array:
 
 HORIZON_S = 24.0 * 3600.0
 STEPS = 2**17
+FIRST_STEPS = 2**8  # looked ahead at first: under three minutes
 STEP_S = HORIZON_S / STEPS  # to which the time that is left is found
 
 
@@ -476,11 +477,13 @@ class AccuracyForecast:
         def exceeds(step: int) -> bool:
             return self.at(time_s + step * STEP_S).bound_m > tolerance_m
 
-        early, late = 0, STEPS
+        early, late = 0, FIRST_STEPS
         if exceeds(early):
             return 0.0
-        if not exceeds(late):
-            return HORIZON_S
+        while not exceeds(late):  # twice as far: within a day a drift comes and is forgotten again
+            if late == STEPS:
+                return HORIZON_S
+            early, late = late, 2 * late
         near, reach = int((self._exceeded_s - time_s) / STEP_S), 1
         while late - early > 1:  # about where it was found last, else by halves
             middle = near if early < near < late else (early + late) // 2

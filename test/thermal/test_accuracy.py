@@ -23,7 +23,7 @@ from robocal_ros.thermal.accuracy import (
 )
 from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.reference import ColdSpots
-from robocal_ros.thermal.tracking import DriftProcess, DriftTracker
+from robocal_ros.thermal.tracking import DriftProcess, DriftState, DriftTracker
 
 
 def test_the_document_is_in_millimetres():
@@ -116,6 +116,23 @@ def test_it_is_due_when_the_bound_reaches_the_tolerance(tracker):
     assert forecast.due_in_s(now, tolerance) == pytest.approx(1800.0, abs=2.0)
     assert forecast.due_in_s(now, 0.5 * forecast.at(now).bound_m) == 0.0
     assert forecast.due_in_s(now, 1.0) == HORIZON_S
+
+
+def test_it_is_due_before_a_drift_that_is_gone_again_within_the_day(arm):
+    """a2 approaches 1 mm, which is forgotten in 8 h: 8/7 (exp(-t / 8 h) - exp(-t / 1 h)) mm."""
+    cell, k = cell_of(arm), len(arm.parameters)
+    spots = ColdSpots.of(cell, visit(cell, postures(6)))
+    tracker = DriftTracker(spots, DriftProcess(1e-18 * np.eye(k)), 1e-9)
+    mean = np.zeros(len(tracker.state.mean))
+    mean[k + arm.parameters.names.index("a2_mm")] = 1e-3
+    tracker.state = DriftState(0.0, mean, np.zeros((len(mean),) * 2))
+    forecast = AccuracyForecast(tracker, arm, Work())
+    assert forecast.at(2.4 * 3600.0).bound_m == pytest.approx(7.43e-4, rel=1e-3)
+    assert forecast.at(HORIZON_S).bound_m < 1e-4
+    due_in_s = forecast.due_in_s(0.0, 3e-4)
+    told = 8.0 / 7.0 * (np.exp(-due_in_s / 28800.0) - np.exp(-due_in_s / 3600.0))
+    assert told == pytest.approx(0.3, abs=1e-3)
+    assert due_in_s < 3600.0
 
 
 def test_when_it_is_due_does_not_depend_on_what_was_asked_before(tracker):
