@@ -542,6 +542,7 @@ def plan_cycle(
     prior: Array,
     sigma_m: float,
     working: Array,
+    tip: Array | None = None,
     count: int = POSES,
     candidates: int = CANDIDATES,
     own: Array | None = None,
@@ -550,15 +551,15 @@ def plan_cycle(
     """Plan ``count`` poses for a placed sensor.
 
     ``prior`` (k, k): covariance of the expected drift, SI; ``sigma_m`` of one visit's coordinate.
-    ``working`` (w, n): poses where the tool must be right. ``own`` (o, n): measuring poses to
-    compare with, or None.
+    ``working`` (w, n): poses where the tool must be right. ``tip`` (3,): its tip on the flange, m;
+    None: the robot file's. ``own`` (o, n): measuring poses to compare with, or None.
     """
     tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
     cell = CellModel(arm, sensor.T_sensor_base, ("sphere",), tool)
     rng = np.random.default_rng(seed)
     found = candidate_poses(cell, field, candidates, rng)
     every = found if own is None else np.vstack([found, own])
-    point = arm.T_flange_tool[:3, 3]
+    point = arm.T_flange_tool[:3, 3] if tip is None else tip
     design = Design.of(cell, every, working, point, prior, sigma_m, COLD_VISITS)
     plan = plan_poses(design.of_first(len(found)), found, count, rng)
     theirs = list(range(len(found), len(every)))

@@ -73,7 +73,7 @@ from robocal_ros.session.events import (
     Command,
     Outcome,
 )
-from robocal_ros.thermal.accuracy import Accuracy
+from robocal_ros.thermal.accuracy import Accuracy, Work
 from robocal_ros.thermal.cell_setup import POSES, SensorField, placed_of, plan_cycle
 from robocal_ros.thermal.drift_following import (
     ARRANGEMENTS,
@@ -172,15 +172,17 @@ SETTINGS = (
     number(
         "work_poses_deg",
         NO_POSES,
-        "Working poses at which accuracy is judged, one after the other, a number for each joint "
-        "(sliding joint: mm); at its default: throughout the joint limits",
+        "Working poses at which accuracy is judged, and for which plan_poses plans, one after the "
+        "other, a number for each joint (sliding joint: mm); at its default: throughout the joint "
+        "limits",
         -1e5,
         1e5,
     ),
     number(
         "tip_mm",
         ORIGIN,
-        "The tool's tip on the flange, which accuracy is about; at its default: the target",
+        "The tool's tip on the flange, which accuracy is about; at its default: the target, and "
+        "the robot file's tool for plan_poses",
         -5000.0,
         5000.0,
         check=count_fault(3),
@@ -284,13 +286,19 @@ class ThermalServices:
     """Services, and the Trigger twins of those that need no more than a name.
 
     ``ask`` gives a command to the session and awaits its outcome; ``prior`` tells the expected
-    drift of the session, (k, k), SI.
+    drift of the session, (k, k), SI; ``work``: where the tool is to be accurate.
     """
 
     def __init__(
-        self, node: RobotNode, ask: Ask, history: CalibrationHistory, prior: Callable[[], Array]
+        self,
+        node: RobotNode,
+        ask: Ask,
+        history: CalibrationHistory,
+        prior: Callable[[], Array],
+        work: Work,
     ) -> None:
         self._ask, self._history, self._nominal = ask, history, node.robot.arm
+        self._work = work
         self._settings, self._prior, add = node.settings, prior, node.add_service
         add(CaptureReference, "~/capture_reference", self._capture_reference)
         add(Identify, "~/identify", self._identify)
@@ -363,13 +371,15 @@ class ThermalServices:
         names = self._nominal.joint_names
         states = [joint_sample(state) for state in request.own]
         own = np.array([state.position[state.order(names)] for state in states])
+        work = self._work
         plan = plan_cycle(
             self._nominal,
             placed_of(sensor),
             SensorField(*(1e-3 * x for x in self._settings["sensor_field_mm"])),
             prior=self._prior(),
             sigma_m=self._settings["sigma_mm"] * 1e-3,
-            working=random_postures(self._nominal),
+            working=random_postures(self._nominal) if work.q is None else work.q,
+            tip=work.tip,
             count=request.count or POSES,
             own=own if states else None,
         )
@@ -460,7 +470,7 @@ class ThermalNode(SessionNode[ThermalSession]):
         self._outputs = ThermalOutputs(self, self._serial_in_use)
         self._on_tf = SensorOnTf(self)
         self._data_clock = DataClock()
-        ThermalServices(self, self._desk.ask, history, self._prior)
+        ThermalServices(self, self._desk.ask, history, self._prior, self._config.work)
         T_flange_tool, tip_m = self._nominal.T_flange_tool.copy(), self._config.tip_m
         if tip_m:
             T_flange_tool[:3, 3] = tip_m

@@ -2,6 +2,7 @@
 """The set-up by services: sensor placed, poses planned, then a reference from the same samples."""
 
 import numpy as np
+import pytest
 from cell import Cell
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
@@ -15,6 +16,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
+from robocal_ros.thermal.identification import drift_prior
 
 POSES = 10
 FIELD_MM = [1500.0, 1500.0, 2000.0, 500.0, 4000.0]
@@ -26,7 +28,9 @@ def placed(graph, method: str = ""):
 
 def test_from_an_unmounted_sphere_to_planned_poses(graph):
     nominal = load_robot("kr150_r3100")
-    cell = Cell(graph, sensor_field_mm=FIELD_MM)
+    work, tip_mm = postures(nominal, 3, seed=7), [0.0, 0.0, 400.0]
+    work_poses_deg = np.degrees(work).ravel().tolist()
+    cell = Cell(graph, sensor_field_mm=FIELD_MM, work_poses_deg=work_poses_deg, tip_mm=tip_mm)
     sensors = graph.collect(TransformStamped, "/thermal_node/sensor", endpoints.LATCHED)
     on_tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     refused = graph.call(PlanPoses, "/thermal_node/plan_poses")
@@ -59,6 +63,10 @@ def test_from_an_unmounted_sphere_to_planned_poses(graph):
     assert len(planned.poses) == 6
     assert 0.0 < planned.predicted_mm < planned.random_mm < planned.before_mm
     assert planned.predicted_mm < planned.own_mm
+    # Of the tool where it works: what is expected to move it there before any cycle.
+    J = nominal.parameter_jacobian(work, 1e-3 * np.array(tip_mm))[:, :3]
+    moved = np.einsum("mik,kl,mil->m", J, drift_prior(nominal), J)
+    assert planned.before_mm == pytest.approx(1e3 * np.sqrt(np.mean(moved)), rel=1e-6)
     joints = np.array([pose.position for pose in planned.poses])
     assert np.all((joints > nominal.lower) & (joints < nominal.upper))
     wrong = [JointState(name=["axis"], position=[0.0])]
