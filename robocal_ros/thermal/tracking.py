@@ -523,19 +523,21 @@ def _left_out(
     """Error (m, 3) at each pose of what all else says, its rms length (m,), and drifts (m, k).
 
     All else: the earlier cycles and the other poses of this one that agree. Cold visit and set-up
-    are estimated along, so that model in force and candidate differ by the drift alone.
+    are estimated along, so that model in force and candidate differ by the drift alone. What
+    silent motors did is in the error: noise to the tracker, it is in no model.
     """
     _, H, _ = tracker.observation(warm, before.time_s)
     D = tracker.drift_rows(before.time_s)
     v, S, k, count = innovation.deviation, innovation.covariance, tracker.count, len(warm)
     forecast, PH = D @ before.mean, D @ before.covariance @ H.T
+    told = H @ before.covariance @ H.T
     kept, pose = np.repeat(innovation.kept, 3), tracker.spots.pose[tracker.spots.match(warm)]
     miss, spread, drifts = np.empty((count, 3)), np.empty(count), np.empty((count, k))
     for i in range(count):
         own, others = slice(3 * i, 3 * i + 3), kept & np.repeat(pose != pose[i], 3)
-        across = S[others, own]
-        gain = np.linalg.solve(S[np.ix_(others, others)], np.column_stack([v[others], across]))
-        miss[i] = v[own] - across.T @ gain[:, 0]
-        spread[i] = np.sqrt(np.trace(S[own, own] - across.T @ gain[:, 1:]))
+        model, across = told[others, own], S[others, own]
+        gain = np.linalg.solve(S[np.ix_(others, others)], np.column_stack([v[others], model]))
+        miss[i] = v[own] - model.T @ gain[:, 0]
+        spread[i] = np.sqrt(np.trace(S[own, own] - (2.0 * across - model).T @ gain[:, 1:]))
         drifts[i] = forecast + PH[:, others] @ gain[:, 0]
     return miss, spread, drifts

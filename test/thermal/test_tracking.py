@@ -15,7 +15,14 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.reference import ColdSpots
-from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, Heat, HeatGains, joints_of
+from robocal_ros.thermal.tracking import (
+    DriftProcess,
+    DriftTracker,
+    Heat,
+    HeatGains,
+    joints_of,
+    track_cycle,
+)
 
 PERIOD_S = 300.0
 
@@ -295,6 +302,25 @@ def test_a_warming_that_nobody_read_is_no_step(arm):
         tracker.read_temperatures(np.zeros(6), 60.0 if silent else 3660.0)
         assert tracker.take(warm, 3660.0).applied == silent
         assert np.trace(tracker.expected_drift()) > 100.0 * np.trace(process.covariance)
+
+
+def test_a_warming_that_nobody_read_is_in_the_figures(arm):
+    """No model follows it: at poses left out both are off by it, as they are everywhere."""
+    cell, q, k = cell_of(arm), postures(6), len(arm.parameters)
+    known = np.zeros((k, 3))
+    known[:, 0] = np.sqrt(np.diag(drift_prior(arm))) / 20.0
+    gains = HeatGains(known.ravel(), 1e-30 * np.eye(3 * k), 3600.0)
+    spots = ColdSpots.of(cell, visit(cell, q))
+    tracker = DriftTracker(spots, DriftProcess(1e-6 * drift_prior(arm)), SIGMA, gains=gains)
+    tracker.read_temperatures(np.zeros(6), 60.0)
+    warm = visit(drifted(cell, 10.0 * known[:, 0]), q)
+    found = track_cycle(tracker, warm, 3660.0, in_force=arm)
+    moved = np.sqrt(np.mean(np.sum(spots.drift(warm) ** 2, axis=1)))
+    assert moved > 5.0 * SIGMA
+    for error in (found.judged.current, found.judged.candidate):
+        assert error.rms_m == pytest.approx(moved, rel=0.2)
+    told = np.sqrt(np.mean(found.found.left_out_sigma**2))
+    assert 0.5 * moved < told < 4.0 * moved  # of twice as many kelvin, in each motor alone
 
 
 @pytest.mark.parametrize("silent_h", [0.25, 2.0, 6.0])
