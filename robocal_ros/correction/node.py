@@ -318,7 +318,7 @@ class JointCorrectionNode(RobotNode):
                 self._refuse_message(topic, Reason.OWN_OUTPUT, fault, now)
             if self._shadow and message.is_finite():
                 self._outputs[topic].publish(message.unchanged())
-            if rivals:
+            if rivals and (topic != TRAJECTORY or message.points):  # anybody may stop the robot
                 self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
             act(message, now)
 

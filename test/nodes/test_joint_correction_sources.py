@@ -108,6 +108,27 @@ def test_planners_that_wait_do_not_hold_up_another(graph: Any) -> None:
     assert len(line.wait(line.paths, 2).points) == 2
 
 
+def test_a_stop_counts_beside_other_publishers(graph: Any) -> None:
+    """Of a supervisor, at once with the trajectory of a planner."""
+    line = Line(graph, stream_gap_s=5.0)  # what is at once, on a machine with other work
+    supervisor = graph.probe.create_publisher(
+        JointTrajectory, "joint_trajectory", endpoints.RELIABLE
+    )
+    two_on(line, "joint_trajectory")
+    line.rest()
+    way = trajectory(np.stack([HOME, HOME + 0.9 * np.eye(6)[0]]), np.array([0.1, 9.0]))
+    line.to_path.publish(way)
+    line.wait(line.paths)
+    path, until_s = line.node._session.output.path, time.monotonic() + 0.5
+    while time.monotonic() < until_s:
+        line.to_states.publish(joints(path.place(time.monotonic())))
+        graph.spin_for(0.02)
+    supervisor.publish(JointTrajectory(joint_names=NAMES))
+    stop = line.wait(line.paths, 2)
+    assert stop.points[-1].positions[0] < HOME[0] + 0.5
+    assert Reason.TWO_SOURCES not in line.node._session.status().refused
+
+
 def test_a_stream_whose_publisher_vanishes_is_told(graph: Any) -> None:
     line = Line(graph)
     line.target()
