@@ -431,6 +431,7 @@ class CorrectionGate:
         self._config = config
         self._model: OfferedModel | None = None
         self.revision: int | None = None  # of the model taken over
+        self._newest_ns = 0  # stamp of all that were taken over
         self.survey = Survey(0.0, 0.0, 0.0)  # its correction over the joint range
         self.waiting: OfferedModel | None = None  # refused, and to be taken over if looked at again
         self.stale = ""  # why the model is too old to be used
@@ -450,8 +451,8 @@ class CorrectionGate:
         """Take over a model; ``places`` (k, n) are where the robot is, and goes.
 
         A revision lower than the one in use comes from a history that began again: it must be
-        newer by its stamp, or be looked at (``again``). One that is refused for this, or for its
-        size here, waits for `look_again`.
+        newer by its stamp than all before, or be looked at (``again``). One that is refused for
+        this, or for its size here, waits for `look_again`.
 
         Raises `RefusedError` when it is not accepted, made for another robot, older than the one
         in use, or would move the tool beyond the bounds where the robot is or goes.
@@ -467,9 +468,9 @@ class CorrectionGate:
             known = self._model
             one, other = (pack_model(self._arm_of(m)) for m in (model, known))
             if same_models(one, other, 0.0) and model.revision == known.revision:
-                self._model = model
+                self._use(model)
                 return
-            if not _later(model, self._model):
+            if not _later(model, known, self._newest_ns):
                 self.waiting = model
                 raise RefusedError(
                     Reason.OLD_REVISION,
@@ -479,9 +480,13 @@ class CorrectionGate:
         arm = self._arm_of(model)
         if len(places):
             self._require_small(model, arm, places)
-        self._model, self.revision = model, model.revision
+        self._use(model)
         self.payload = payload_note(arm, model.load, self._reference.load)
         self.survey = survey(self._reference, arm, self._config.thermal)
+
+    def _use(self, model: OfferedModel) -> None:
+        self._model, self.revision = model, model.revision
+        self._newest_ns = max(self._newest_ns, model.stamp_ns)
 
     def watch_age(self, now_ns: int) -> bool:
         """Compare the model's stamp with the clock; returns whether it became stale, or fresh."""
@@ -560,7 +565,7 @@ class ToolGate:
     """Judges the measured tools of this robot, and keeps the last good one until it may be used.
 
     One that is ``waiting`` is adopted when the robot stands or a trajectory begins; one that was
-    ``refused`` is older than the one before by revision and stamp, and is to be looked at again.
+    ``refused`` is older than those before by revision and stamp, and is to be looked at again.
     """
 
     def __init__(self, taught: Array, config: CorrectionConfig) -> None:
@@ -569,6 +574,7 @@ class ToolGate:
         self.in_use: OfferedTool | None = None
         self.waiting: OfferedTool | None = None
         self.refused: OfferedTool | None = None
+        self._newest_ns = 0  # stamp of all that were taken
 
     @property
     def T_flange_tool(self) -> Array | None:
@@ -578,8 +584,9 @@ class ToolGate:
     def take(self, tool: OfferedTool, *, again: bool = False) -> None:
         """Let a tool wait for its adoption; one that is in use already only ends the wait.
 
-        A revision that is not newer than the last one must be newer by its stamp, or be looked
-        at (``again``); that it says nothing of the mounted tool any more, or does again, is news.
+        A revision that is not newer than the last one must be newer by its stamp than all before,
+        or be looked at (``again``); that it says nothing of the mounted tool any more, or does
+        again, is news.
 
         Raises `RefusedError` when it is not accepted, its frames are not the configured ones, it
         is older than the last one, or too far from the taught tool.
@@ -596,7 +603,7 @@ class ToolGate:
         self.refused = None
         last = self.waiting or self.in_use
         known = last is not None and _same_tool(tool, last)
-        later = last is None or _later(tool, last) or _retaught(tool, last)
+        later = last is None or _later(tool, last, self._newest_ns) or _retaught(tool, last)
         if not (known or later or again):
             self.refused = tool
             raise RefusedError(
@@ -604,6 +611,7 @@ class ToolGate:
                 f"tool revision {tool.revision} is another tool than the last one and not newer "
                 "by its stamp; ~/take_over takes it over",
             )
+        self._newest_ns = max(self._newest_ns, tool.stamp_ns)
         if self.in_use is not None and _same_tool(tool, self.in_use):
             self.in_use, self.waiting = tool, None
         else:
@@ -635,5 +643,6 @@ def _retaught(a: OfferedTool, b: OfferedTool) -> bool:
     return same and (a.T_flange_tool is None) != (b.T_flange_tool is None)
 
 
-def _later(a: OfferedCalibration, b: OfferedCalibration) -> bool:
-    return a.revision > b.revision or a.stamp_ns > b.stamp_ns
+def _later(a: OfferedCalibration, b: OfferedCalibration, newest_ns: int) -> bool:
+    """Whether one is newer than the last, whose own stamp is an old one after a rollback."""
+    return a.revision > b.revision or a.stamp_ns > newest_ns

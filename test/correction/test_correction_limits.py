@@ -161,6 +161,17 @@ def test_a_history_that_began_again_is_taken_over_by_its_stamp(revision: int) ->
     assert distance(pose(drifted(0.5), q), pose(NOMINAL, HOME)) < 1e-9
 
 
+def test_a_model_that_was_rolled_back_stays_so_where_its_message_is_repeated() -> None:
+    """What is in force by then was measured before it."""
+    robot = Robot()
+    withdrawn = offer(drifted(), 7, stamp_ns=200)
+    robot.session.offer_model(withdrawn)
+    for arm, revision, stamp_ns in ((drifted(0.5), 8, 100), (NOMINAL, 9, 0)):
+        robot.session.offer_model(offer(arm, revision, stamp_ns=stamp_ns))
+        refused(Reason.OLD_REVISION, robot.session.offer_model, withdrawn)
+        assert robot.session.status().revision == revision
+
+
 @pytest.mark.parametrize("on", [False, True])
 def test_a_history_that_began_again_waits_for_the_operator_without_a_newer_stamp(on: bool) -> None:
     robot = Robot()

@@ -146,6 +146,17 @@ def test_an_older_tool_waits_for_a_newer_stamp_or_the_operator(robot: Robot) -> 
     assert robot.session.status().tool_revision == 4
 
 
+def test_a_tool_that_was_rolled_back_stays_so_where_its_message_is_repeated(robot: Robot) -> None:
+    """Also to none; what is in force by then was measured before it."""
+    withdrawn = bent_tool(revision=5, stamp_ns=200)
+    robot.change_tool(withdrawn)
+    robot.change_tool(bent_tool(1e-3, revision=6, stamp_ns=100))
+    refused(Reason.OLD_REVISION, robot.session.offer_tool, withdrawn)
+    robot.change_tool(bent_tool(revision=7, T_flange_tool=None))
+    refused(Reason.OLD_REVISION, robot.session.offer_tool, withdrawn)
+    assert not robot.session.status().new_tool
+
+
 def test_that_a_tool_says_nothing_of_the_mounted_one_is_news(robot: Robot) -> None:
     """tcf_node says so of the same revision, once another tool is taught; and takes it back."""
     robot.change_tool(bent_tool(revision=5, stamp_ns=10))
