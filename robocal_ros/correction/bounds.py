@@ -434,6 +434,7 @@ class CorrectionGate:
         self._newest_ns = 0  # stamp of all that were taken over
         self.survey = Survey(0.0, 0.0, 0.0)  # its correction over the joint range
         self.waiting: OfferedModel | None = None  # refused, and to be taken over if looked at again
+        self._now_ns: int | None = None  # of the clock that stamps models, as it was told last
         self.stale = ""  # why the model is too old to be used
         self.payload = ""  # what it may cost that the arm carries another load than the model's
         self.tools = ToolGate(reference.T_flange_tool, config)
@@ -487,19 +488,23 @@ class CorrectionGate:
     def _use(self, model: OfferedModel) -> None:
         self._model, self.revision = model, model.revision
         self._newest_ns = max(self._newest_ns, model.stamp_ns)
+        self._judge_age()
 
     def watch_age(self, now_ns: int) -> bool:
         """Compare the model's stamp with the clock; returns whether it became stale, or fresh."""
-        was, limit_s = bool(self.stale), self._config.model_age_s
-        self.stale = ""
-        if self._model is not None and limit_s > 0.0:
-            age_ns = now_ns - self._model.stamp_ns
+        was, self._now_ns = bool(self.stale), now_ns
+        self._judge_age()
+        return was != bool(self.stale)
+
+    def _judge_age(self) -> None:
+        self.stale, limit_s = "", self._config.model_age_s
+        if self._model is not None and self._now_ns is not None and limit_s > 0.0:
+            age_ns = self._now_ns - self._model.stamp_ns
             if abs(age_ns) > limit_s * 1e9:
                 old = f"{abs(age_ns) * 1e-9:.1f} s " + ("old" if age_ns > 0 else "in the future")
                 self.stale = (
                     f"model revision {self._model.revision} is {old}, allowed {limit_s:g} s"
                 )
-        return was != bool(self.stale)
 
     def look_again(self, places: Array) -> None:
         """Take over the model that waits for it, if there is one; raises as `take_model`."""

@@ -205,11 +205,12 @@ class JointCorrectionNode(RobotNode):
         self._tell()
 
     def activate(self) -> None:
-        """Look who else is there, and tell at once what is done.
+        """Look at the clock and who else is there, and tell at once what is done.
 
         Also in the log: the first line of a process takes rclpy some 50 ms, which a refusal in
         motion has not.
         """
+        self._session.look(time.monotonic(), self.now_ns())
         self._look_at_graph()
         self._tell()
         self.get_logger().info(self._session.status(time.monotonic()).in_words())

@@ -181,7 +181,10 @@ class CorrectionSession:
         self._held.pop(reason, None)
 
     def offer_model(self, model: OfferedModel) -> None:
-        """Take over an accepted model of this robot; refused models change nothing."""
+        """Take over an accepted model of this robot; refused models change nothing.
+
+        How old it is, is told by the clock of the last `look`.
+        """
         self.counted(lambda: self._gate.take_model(model, self._places()))
         self._want()
 

@@ -84,6 +84,22 @@ def test_an_old_model_is_blended_out_and_a_fresh_one_in(aged: Robot) -> None:
     assert np.allclose(aged.settle(), at, rtol=0.0, atol=ROUNDING)
 
 
+@pytest.mark.parametrize("looked_at_again", [False, True])
+def test_a_model_that_is_too_old_when_it_comes_corrects_nothing(looked_at_again: bool) -> None:
+    robot, path = Robot(model_age_s=60.0), still(first_s=1.0)
+    session, old = robot.session, offer(drifted(3.0), stamp_ns=100 * SECOND)
+    session.look(robot.now, 1000 * SECOND)
+    session.enable(True)
+    if looked_at_again:
+        session.offer_model(offer(drifted(), 2, stamp_ns=1000 * SECOND))
+        refused(Reason.OLD_REVISION, session.offer_model, old)
+        session.take_over()
+    else:
+        session.offer_model(old)
+    assert "900.0 s old" in session.status().stale
+    assert session.trajectory(path, robot.now) is path
+
+
 def test_a_clock_that_jumps_only_starts_blends(aged: Robot) -> None:
     """A model is stale and fresh by turns: every step is a blend's."""
     last = aged.at
