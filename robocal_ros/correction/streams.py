@@ -231,6 +231,7 @@ class TargetStream:
             self._sent.clear()
             self.period_s, self._step_period_s, self._beat_s = np.nan, LONGEST_STEP_S, now_s
         self._note_period(self._period_at(now_s), now_s)
+        kept = self._index, self._whole, self._active.copy(), self._command
         if begins or index is not self._index:
             new = index[self._active[index] == 0.0]
             if len(new):
@@ -245,9 +246,13 @@ class TargetStream:
             self._velocity[index] = velocity
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
         self.is_usual = False
-        self._advance(now_s)
-        self.is_usual = self._whole and self.lag_s == 0.0 and not self._held_up
-        message = self._message(command)
+        try:
+            self._advance(now_s)
+            self.is_usual = self._whole and self.lag_s == 0.0 and not self._held_up
+            message = self._message(command)
+        except RefusedError:  # what is slowed down then are the joints that went out
+            self._index, self._whole, self._active[:], self._command = kept
+            raise
         output.path = None  # which the controller goes on with where the target is refused
         return message
 

@@ -485,6 +485,25 @@ def test_the_slow_down_of_an_uneven_stream_begins_as_fast_as_it_was() -> None:
         assert np.all(np.abs(np.diff(speeds[1:])) <= slows + 1e-9)
 
 
+def test_a_refused_target_of_one_joint_slows_all_of_its_stream_down() -> None:
+    robot, q = Robot(), HOME.copy()
+    for k in range(250):
+        q = q + 0.5 * min(k * DT / 0.3, 1.0) * DT
+        robot.stream(q)
+    far = {"names": NAMES[:1], "q": q[:1] + 1.0}
+    refused(Reason.VELOCITY_LIMIT, robot.stream, **far)
+    speeds = [np.full(6, 0.5)]
+    while (command := robot.session.stream.tail(robot.now)) is not None:
+        assert command.names == NAMES
+        speeds.append((command.position - robot.at) / DT)
+        robot.go(command)
+        robot.now += DT
+    slower = -np.diff(speeds, axis=0)
+    assert np.all(slower[1:] <= LIMITS["acceleration_limits"] * DT + 2 * ROUNDING / DT)
+    assert np.all(speeds[1] > 0.4)
+    assert np.all(np.abs(speeds[-1]) <= LIMITS["acceleration_limits"] * DT)
+
+
 @pytest.mark.parametrize("left_deg_s", [0.0, 4.0, 20.0])
 def test_a_stream_that_slows_down_is_ended_as_fast_as_it_is_by_then(left_deg_s: float) -> None:
     """Its last 0.1 s are a parabola, whose slope at the end is known."""
