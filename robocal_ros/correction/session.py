@@ -66,7 +66,6 @@ Answer = TypeVar("Answer")
 # A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
 TARGET: tuple[str, tuple[str, ...]] = "target", ()  # their order is one for all sources
-NEVER = 0, -math.inf
 MOST_SOURCES = 64  # of so many drivers the order in time is watched one by one
 AHEAD_S = 0.02  # a source's clock may run ahead by so much from one message to the next
 # What is dropped without ending a stream, as it is not the stream's: unless nothing came for so
@@ -118,8 +117,9 @@ class CorrectionSession:
         self._unsettled: tuple[int, float] | None = None
         self._held: dict[Reason, str] = {}
         self._interrupts: SentPath | None = None  # the last path that took a stream's place
-        # of each kind and source: the last stamp, ns, and when it came
-        self._stamps: dict[tuple[str, tuple[str, ...]], tuple[int, float]] = {}
+        # of each kind and source: the last stamp, ns, and when it came; then, where one has gone
+        # ahead of it since, the last that did
+        self._stamps: dict[tuple[str, tuple[str, ...]], tuple[tuple[int, float], ...]] = {}
         self._lateness: dict[tuple[str, ...], Lateness] = {}
         self.late_s = 0.0  # of the last readings, see `Lateness`
         self._refused: Counter[Reason] = Counter()
@@ -262,15 +262,15 @@ class CorrectionSession:
         if like is None or len(came) != like.size or self._held or self._config.shadow:
             return None
         sec, nanosec = STAMPS.unpack_from(came, STAMP)
-        stamp, (last, came_s) = sec * SECOND_NS + nanosec, self._stamps.get(TARGET, NEVER)
-        if stamp and not (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9):
+        stamp, known = sec * SECOND_NS + nanosec, self._stamps.get(TARGET)
+        if stamp and not (known and _goes_on(stamp, now_s, *known[0])):
             return None
         became = stream.follow(came, now_s)
         if became == UNUSUAL:
             return None
         if became == FAST_ONE:
             if stamp:
-                self._stamps[TARGET] = stamp, now_s
+                self._stamps[TARGET] = ((stamp, now_s),)
             try:
                 stream.velocity_out()
             except RefusedError as error:
@@ -285,7 +285,7 @@ class CorrectionSession:
             stamp, now_s = self._unsettled
             self._unsettled = None
             if stamp:
-                self._stamps[TARGET] = stamp, now_s
+                self._stamps[TARGET] = ((stamp, now_s),)
             self._goal[:] = self.stream.like.room[GIVEN]
             self.stream.settle()
 
@@ -520,7 +520,7 @@ class CorrectionSession:
         """Refuse what carries a mark of a correction, or was overtaken by a newer one.
 
         Readings have one order in time for each driver, by its joints. A stamp that went ahead by
-        more than the time that passed does not bar those after it.
+        more than the time that passed does not bar those after it, unless the next goes on from it.
         """
         mark, stamp = came.mark, came.stamp_ns
         if mark and (mark == CORRECTED or (mark == TAUGHT and kind == "reading")):
@@ -531,13 +531,13 @@ class CorrectionSession:
         known = stamps.get(key)
         if known is None:
             key = key if len(stamps) < MOST_SOURCES else (kind, ())
-            known = stamps.get(key, (stamp, now_s))
-        last, came_s = known
+            known = stamps.get(key, ((stamp, now_s),))
+        last = known[0][0]
         if stamp < last and last - stamp <= CLOCK_RESET_NS:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
             raise RefusedError(Reason.TIME_BACKWARDS, detail)
-        if stamp <= last + (now_s - came_s + AHEAD_S) * 1e9:
-            stamps[key] = stamp, now_s
+        is_next = stamp < last or any(_goes_on(stamp, now_s, *one) for one in known)
+        stamps[key] = ((stamp, now_s),) if is_next else (known[0], (stamp, now_s))
 
     def status(self, now_s: float | None = None) -> CorrectionStatus:
         """What the session does; ``now_s``: while a trajectory is under way, at which instant."""
@@ -590,6 +590,11 @@ class CorrectionSession:
         moved = self._reference.fk(np.vstack([place, place + withheld]))
         tips = (moved @ self._reference.T_flange_tool)[:, :3, 3]
         return float(np.linalg.norm(tips[1] - tips[0]))
+
+
+def _goes_on(stamp: int, now_s: float, last: int, came_s: float) -> bool:
+    """Whether a stamp is ahead of one that came before by no more than the time that passed."""
+    return last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9
 
 
 @lru_cache(MOST_SOURCES)

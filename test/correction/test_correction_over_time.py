@@ -184,7 +184,7 @@ def happen(robot: Robot, watch: Watch, what: str, seed: int, revision: int, q: n
     elif what == "pause":
         robot.rest(0.3 + 0.3 * seed)
     elif what == "backwards":
-        robot.session._stamps["target", ()] = 10**18, robot.now
+        robot.session._stamps["target", ()] = ((10**18, robot.now),)
         with np.testing.assert_raises(RefusedError):
             robot.stream(q, stamp_ns=10**18 - 10**6)
         robot.session._stamps.clear()

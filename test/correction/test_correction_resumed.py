@@ -109,6 +109,14 @@ def test_a_stamp_far_ahead_bars_no_message_after_it() -> None:
     assert robot.session.status().refused == {}
 
 
+def test_the_order_is_that_of_a_source_s_clock_that_was_set_ahead() -> None:
+    """From its second message on."""
+    robot = Robot()
+    for dt, stamp_ms in ((0.05, 1000), (0.001, 1050), (0.01, 1060)):
+        robot.stream(dt=dt, stamp_ns=stamp_ms * 10**6)
+    refused(Reason.TIME_BACKWARDS, robot.stream, dt=0.001, stamp_ns=1055 * 10**6)
+
+
 def test_a_clock_that_was_set_back_ends_a_stream_in_order() -> None:
     robot, q, stamp = Robot(), HOME.copy(), 10**18
     for k in range(200):

@@ -193,6 +193,18 @@ def _follows(fill: Callable[[bytes, int], bytes]) -> list[bool]:
     return line.followed
 
 
+def test_two_targets_after_its_source_s_clock_was_set_ahead_they_are_usual_again() -> None:
+    line = Line(usual=True)
+    line.session.offer_model(offer(drifted(1.0)))
+    line.session.enable(True)
+    for k in range(200):
+        line.robot.now += DT
+        line.robot.read(line.robot.at)
+        stamp_ns = round((1.0 + k * DT + 0.05 * (k >= 100)) * 1e9)
+        line.sends(_message(JointCommand(NAMES, HOME + 1e-4 * k), stamp_ns))
+    assert line.followed[2:] == [*98 * [True], False, False, *98 * [True]]
+
+
 def _filled(came: bytes, number: int) -> bytes:
     fill = 3 * bytes([number])
     filled, count = re.subn(
