@@ -430,6 +430,7 @@ class CorrectionGate:
         self._serial = serial
         self._config = config
         self._model: OfferedModel | None = None
+        self._arm = reference  # that it says; the reference where it knows no drift
         self.revision: int | None = None  # of the model taken over
         self._newest_ns = 0  # stamp of all that were taken over
         self.survey = Survey(0.0, 0.0, 0.0)  # its correction over the joint range
@@ -442,9 +443,7 @@ class CorrectionGate:
     @property
     def actual(self) -> SerialArm:
         """The actual arm with its tool, as far as they are known; else the reference's."""
-        arm = self._reference
-        if self._model is not None and not self.stale:
-            arm = self._arm_of(self._model)
+        arm = self._reference if self.stale else self._arm
         tool = self.tools.T_flange_tool
         return arm if tool is None else replace(arm, T_flange_tool=tool)
 
@@ -486,7 +485,7 @@ class CorrectionGate:
         self.survey = survey(self._reference, arm, self._config.thermal)
 
     def _use(self, model: OfferedModel) -> None:
-        self._model, self.revision = model, model.revision
+        self._model, self._arm, self.revision = model, self._arm_of(model), model.revision
         self._newest_ns = max(self._newest_ns, model.stamp_ns)
         self._judge_age()
 
@@ -500,7 +499,7 @@ class CorrectionGate:
         self.stale, limit_s = "", self._config.model_age_s
         if self._model is not None and self._now_ns is not None and limit_s > 0.0:
             age_ns = self._now_ns - self._model.stamp_ns
-            if abs(age_ns) > limit_s * 1e9:
+            if abs(age_ns) > limit_s * 1e9 and self._arm is not self._reference:
                 old = f"{abs(age_ns) * 1e-9:.1f} s " + ("old" if age_ns > 0 else "in the future")
                 self.stale = (
                     f"model revision {self._model.revision} is {old}, allowed {limit_s:g} s"

@@ -14,6 +14,7 @@ from correction_robot import (
     LARGEST_A,
     LIMITS,
     NAMES,
+    NOMINAL,
     REST,
     REST_A,
     ROUNDING,
@@ -113,6 +114,14 @@ def test_a_clock_that_jumps_only_starts_blends(aged: Robot) -> None:
 def test_without_a_limit_no_model_is_stale() -> None:
     robot = Robot()
     robot.session.offer_model(offer(drifted(), stamp_ns=1))
+    robot.session.look(robot.now, 10**18)
+    assert not robot.session.status().stale
+
+
+def test_that_no_drift_is_known_does_not_grow_old() -> None:
+    """The nominal model is of no measurement: thermal_node gives it the stamp 0."""
+    robot = Robot(model_age_s=60.0)
+    robot.session.offer_model(offer(NOMINAL, 0))
     robot.session.look(robot.now, 10**18)
     assert not robot.session.status().stale
 
