@@ -320,6 +320,8 @@ class DesiredOffset:
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
         self.made = False  # whether the last message was corrected with ``stage``
+        self._bound: Reason | None = None  # what bound the offsets that were wanted last
+        self._weak = 0  # of how many of these a part was given up
         self._span = np.array([reference.lower, reference.upper], dtype=np.float64)
         bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
         self._bounds = np.array(bounds, dtype=np.float64)
@@ -343,8 +345,11 @@ class DesiredOffset:
             self.whole_step = self._span, self._bounds, self._tcp, *given
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
-        """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
-        self.made = False
+        """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says.
+
+        Nothing is counted: see `count`.
+        """
+        self.made, self._bound, self._weak = False, None, 0
         self.figures[SHIFT : REMAINING + 1] = 0.0
         if self.stage is None:
             return np.zeros_like(q), None
@@ -357,16 +362,22 @@ class DesiredOffset:
         if policy is Policy.REFUSE:
             require_within(result, self._config, self._arm)
         elif isinstance(result, ClampedResult) and result.reason is not None:
+            self._bound = result.reason
             if policy is Policy.PASS:
-                self.passed[result.reason] += 1
                 return np.zeros_like(q), None
-            self.clamped[result.reason] += 1
         offset, self.made = result.q - q, True
-        self.figures[REDUCED] += np.count_nonzero(result.weak)
+        self._weak = int(np.count_nonzero(result.weak))
         self.figures[SHIFT] = result.arm.tcp_shift_m.max()
         self.figures[LARGEST] = np.abs(offset).max()
         self.figures[REMAINING] = result.remaining_m.max()
         return offset, result
+
+    def count(self) -> None:
+        """Count what bound the offsets that were wanted last: they go out."""
+        if self._bound is not None:
+            passes = self._config.policy is Policy.PASS
+            (self.passed if passes else self.clamped)[self._bound] += 1
+        self.figures[REDUCED] += self._weak
 
     def put_out(
         self,
@@ -395,6 +406,8 @@ class DesiredOffset:
         else:
             desired = self.at(q[None])[0][0]
         share = put_out(memory, q, desired, elapsed, longest, limits, active, speeds[0], span)
+        if stage is not None and 0.0 <= share <= 1.0 + ROUNDING:
+            self.count()
         if isinstance(stage, ClampedCorrection) and self.made and not limiter.withheld.any():
             memory[VELOCITY] = stage.velocity_one(memory[TAUGHT], velocity, memory[OUT])
         else:

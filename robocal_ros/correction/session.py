@@ -364,6 +364,7 @@ class CorrectionSession:
     def _shadow(self, q: Array) -> None:
         with contextlib.suppress(RefusedError):  # counted, and in the status
             self.counted(lambda: self._desired.at(q))
+            self._desired.count()
         self.output.stage = self._desired.stage
 
     def reading(self, state: JointCommand, now_s: float, age_s: float = 0.0) -> JointCommand:

@@ -85,6 +85,7 @@ class TrajectoryCorrector:
             self._require_speeds(command, index, out, (velocity, acceleration), times, led_from)
         finally:
             limiter.state[:], limiter.limits = kept, limits
+        self._desired.count()
         known_times = command.time_from_start_s
         sent = np.stack([offsets, rates, bends, offsets - desired])
         if led_from is not None:  # until its first point: from the offset that there is now

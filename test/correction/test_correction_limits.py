@@ -393,6 +393,17 @@ def test_a_trajectory_is_clamped_or_passed_on_as_a_whole() -> None:
         assert counted == {Reason.TCP_BOUND: 1}
 
 
+def test_what_is_clamped_is_counted_where_it_goes_out() -> None:
+    robot = corrected(Policy.CLAMP, velocity_limits=np.ones(6))
+    robot.read(HOME)
+    refused(Reason.TOO_SHORT, robot.session.trajectory, still(seconds=1e-3), robot.now)
+    assert not robot.session.status().clamped
+    outputs(robot, 400)
+    robot.stream(HOME + 0.01)  # so far in several steps
+    assert robot.session.status().lag_s > 0.0
+    assert robot.session.status().clamped == {Reason.TCP_BOUND: 401}
+
+
 def test_a_blend_along_a_trajectory_is_no_faster_where_a_bound_holds_on_a_part_of_it() -> None:
     """The clamped shift is made on the first third of the blend, and then stays."""
     robot = Robot(rested=False, policy=Policy.CLAMP, thermal=ShiftBounds(0.1e-3, 0.1, 0.1))
