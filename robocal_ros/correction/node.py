@@ -691,7 +691,7 @@ class JointCorrectionNode(RobotNode):
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
         faults = [*self._faults(), *filter(None, [self._stop_fault, self._graph.lost])]
-        return self._report.health(faults, self._rivals())
+        return self._report.health(faults, [*self._rivals(), self._hard_stop.absent])
 
 
 def main() -> None:

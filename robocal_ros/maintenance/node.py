@@ -44,14 +44,9 @@ from robocal_ros.maintenance.services import (
 )
 from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState
 from robocal_ros.motion.cell import load_motion
-from robocal_ros.motion.driver import (
-    LeaseHolder,
-    MotionDriver,
-    SteadyClock,
-    goal_tolerances,
-    guarded,
-)
+from robocal_ros.motion.driver import LeaseHolder, MotionDriver, goal_tolerances, guarded
 from robocal_ros.motion.robot_watch import BEHIND_S, MotionReport
+from robocal_ros.motion.steady_clock import SteadyClock
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, EndpointNode, Health, NotActiveError
@@ -470,8 +465,9 @@ class MaintenanceNode(RobotNode):
         health.values = values
         if status.state is MaintenanceState.FAULT:
             health.worsen(ERROR, status.fault)
-        for trouble in (session.robot.trouble(self._steady.now_s()), self._motion.late()):
-            health.worsen(WARN, trouble) if trouble else None
+        troubles = session.robot.trouble(self._steady.now_s()), self._motion.late()
+        for trouble in filter(None, (*troubles, self._motion.hard_stop.absent)):
+            health.worsen(WARN, trouble)
         faults = self._guard.fault, self._others.violation, self._sources.doubt(), status.trouble
         for words in filter(None, faults):
             health.worsen(ERROR, words)

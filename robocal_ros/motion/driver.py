@@ -379,13 +379,24 @@ class HardStopService:
         self._node = node
         self._client = node.add_client(Trigger, service) if service else None
 
+    @property
+    def absent(self) -> str:
+        """That nobody serves the one that is named, in words; else empty."""
+        client = self._client
+        if client is None or client.service_is_ready():
+            return ""
+        return f"hard_stop_service: nobody serves {client.srv_name}"
+
     def __call__(self, why: str) -> None:
         """Call it, and tell why and what it answers."""
         logger, client = self._node.get_logger(), self._client
         if client is None:
             logger.error(f"{why}: stop the robot by hand (hard_stop_service is empty)")
             return
-        logger.error(f"{why}: {client.srv_name} is called")
+        if absent := self.absent:  # called all the same: discovery may have lost it
+            logger.error(f"{why}: stop the robot by hand ({absent})")
+        else:
+            logger.error(f"{why}: {client.srv_name} is called")
 
         def told(future: Future) -> None:
             answer: Any = future.result()
@@ -666,34 +677,3 @@ class LeaseHolder:
                 purpose=purpose,
             )
         )
-
-
-class SteadyClock:
-    """Seconds that no setting of the clock changes, those of a suspended host included.
-
-    What was heard before it was suspended is old when it wakes. A motion is not: the controller of
-    the same host stood still with it.
-
-    ``slept``: takes for how long the host was suspended, before a time of afterwards is given out.
-    """
-
-    def __init__(self, slept: Callable[[float], None]) -> None:
-        self._slept = slept
-        self._asleep_s = _both()[1]
-
-    def now_s(self) -> float:
-        """What it shows."""
-        now_s, asleep_s = _both()
-        if asleep_s > self._asleep_s:
-            for_s, self._asleep_s = asleep_s - self._asleep_s, asleep_s
-            self._slept(for_s)
-        return now_s
-
-
-def _both() -> tuple[float, float]:
-    """The time, and how much of it the host was asleep, at least.
-
-    The second clock is read later: what passes in between makes it less, never more.
-    """
-    now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
-    return now_s, now_s - time.clock_gettime(time.CLOCK_MONOTONIC)

@@ -22,13 +22,13 @@ from robocal_ros.motion.driver import (
     MOTION,
     LeaseHolder,
     MotionDriver,
-    SteadyClock,
     driving_config,
     goal_tolerances,
     require_limits,
 )
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import BEHIND_S, Gap, MotionReport
+from robocal_ros.motion.steady_clock import SteadyClock
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS, StaticTf, header, pose_message, transform_message
 from robocal_ros.ros.endpoints import NotActiveError
@@ -347,7 +347,8 @@ class TcfMotion:
         """What is to be warned of; empty: nothing."""
         if self.driver is None:
             return ""
-        return self.driver.trouble(self._steady.now_s()) or self._motion.late()
+        trouble = self.driver.trouble(self._steady.now_s()) or self._motion.late()
+        return "; ".join(filter(None, (trouble, self._motion.hard_stop.absent)))
 
     @property
     def fault(self) -> str:

@@ -345,6 +345,14 @@ def test_the_accuracy_of_another_robot_does_not_count(graph):
     assert node.inputs[ACCURACY].invalid == 3
 
 
+def test_a_hard_stop_that_nobody_serves_is_warned_of(graph):
+    node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "hard_stop_service": "/hard_stop"})
+    nobody = "hard_stop_service: nobody serves /hard_stop"
+    assert nobody in node.health().message
+    graph.probe.create_service(Trigger, "/hard_stop", lambda request, response: response)
+    graph.spin_until(lambda: nobody not in node.health().message, "it is served")
+
+
 def test_a_figure_that_cannot_be_is_no_drift(graph):
     poses = [angle + 10.0 for angle in HOME_DEG]
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "measuring_poses_deg": poses})

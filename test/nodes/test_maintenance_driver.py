@@ -21,9 +21,10 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceDriver
 from robocal_ros.maintenance.robot_interface import Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import COPIES, COPY_S, MotionDriver, SteadyClock
+from robocal_ros.motion.driver import COPIES, COPY_S, MotionDriver
 from robocal_ros.motion.plan import JointPlan, MotionLimits, stop
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
+from robocal_ros.motion.steady_clock import SteadyClock
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.graph import actions_beside
 

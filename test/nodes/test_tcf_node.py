@@ -94,6 +94,15 @@ def test_it_moves_nothing_without_a_heartbeat(graph: Any, tmp_path: Any) -> None
     assert refused.message.startswith("gap_open was never heard")
 
 
+def test_a_hard_stop_that_nobody_serves_is_warned_of(graph: Any, tmp_path: Any) -> None:
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    LiveCell(graph, tmp_path, TRUTH, motion="trajectory", hard_stop_service="/hard_stop")
+    words = "hard_stop_service: nobody serves /hard_stop"
+    graph.spin_until(
+        lambda: any(words in s.message for array in said for s in array.status), "the warning"
+    )
+
+
 def test_joint_states_that_come_late_are_a_warning_to_who_moves_the_robot(
     graph: Any, tmp_path: Any
 ) -> None:

@@ -18,6 +18,7 @@ from follower import ACTION, HOME, NAMES, Follower
 from joint_correction_live import NODE, NOMINAL, drifted, model_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
@@ -484,7 +485,7 @@ def parts(graph: Any, request: Any) -> Iterator[Any]:
     robot = cell.robot = InParts(request.param, context=graph.context)
     graph.executor.add_node(robot)
     cell.called = []
-    robot.create_service(
+    cell.hard_stop = robot.create_service(
         Trigger, "/hard_stop", lambda request, response: cell.called.append(request) or response
     )
     cell.node = graph.add(JointCorrectionNode, SETTINGS | {"hard_stop_service": "/hard_stop"})
@@ -529,6 +530,20 @@ def test_a_stop_of_before_a_deactivation_ends_with_it(parts: Any) -> None:
     assert parts.node.is_active
     assert not parts.called
     assert not parts.node._stop_fault
+
+
+@pytest.mark.parametrize("parts", [True], indirect=True)
+def test_a_hard_stop_that_nobody_serves_is_told_before_and_when_it_is_wanted(parts: Any) -> None:
+    graph, robot, node = parts.graph, parts.robot, parts.node
+    logs = graph.collect(Log, "/rosout")
+    nobody = "hard_stop_service: nobody serves /hard_stop"
+    assert nobody not in node.health().message
+    robot.destroy_service(parts.hard_stop)
+    graph.spin_until(lambda: nobody in node.health().message, "the warning")
+    robot.destroy_publisher(robot.status)
+    by_hand = f"stop the robot by hand ({nobody})"
+    graph.spin_until(lambda: any(by_hand in log.msg for log in logs), by_hand, 10.0)
+    assert not any("/hard_stop is called" in log.msg for log in logs)
 
 
 # ---- node and controller as processes: the node in its own executor -----------------------------

@@ -24,12 +24,12 @@ from robocal_ros.motion.driver import (
     CONTROLLER,
     MOTION,
     MotionDriver,
-    SteadyClock,
     driving_config,
     goal_tolerances,
 )
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import BEHIND_S, MotionReport
+from robocal_ros.motion.steady_clock import SteadyClock
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import NS
