@@ -436,9 +436,8 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     if args.robot_serial is not None and len(q):
         with model_history(args, nominal) as history:
             in_force = shift_in_force(history, models, q, T_first)
-    if args.in_force:
-        shift = _as_they_are(models, work) if in_force is None else in_force.shift
-    else:
+    kept = shift = _as_they_are(models, work) if in_force is None else in_force.shift
+    if not args.in_force:
         shift = best_shift(
             models,
             q,
@@ -447,15 +446,16 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
             weight=weight,
             lever_m=1e-3 * args.lever_mm,
         )
-    words = None if args.maker is None else _shifted_text(args, shift, T_first)
-    if args.output is not None:
-        write_bytes(args.output, f"{words}\n".encode())
     found: ShiftDocument | None = None
     verdict = Verdict(Code.ACCEPT, "no shift is in force: the frames are as they were")
     was = None if in_force is None else in_force.document(args.limit_mm)
     if len(q):
         found = shift_document(shift, work.names, args.limit_mm)
         verdict = shift_verdict(found, was, args.in_force)
+    serves = shift if verdict.accept else kept
+    words = None if args.maker is None else _shifted_text(args, serves, T_first)
+    if args.output is not None:
+        write_bytes(args.output, f"{words}\n".encode())
     document: FrameShiftDocument = {
         "robot": nominal.name,
         "model_hash": nominal.model_hash,
@@ -563,6 +563,8 @@ def _show_shift(console: "Console", document: Document) -> None:
         rows = [_six_numbers(part, document[f"T_{part}_shift"]) for part in PARTS]
         print_table(console, "The shift, its turn as a rotation vector", head, rows)
     else:
+        if not document["verdict"]["accept"]:
+            print_words(console, "The frames stay as they are:")
         console.out(document["text"], highlight=False)
     print_output(console, document)
 

@@ -110,7 +110,7 @@ class FrameShiftDocument(RobotDocument, ShiftedFramesDocument):
     poses: list[ShiftedPoseDocument]
     maker: Annotated[Maker | None, "Null where none was named, to tell what is in force."]
     text: Annotated[
-        Words | None, "The frames as shifted, for the controller; null without a maker."
+        Words | None, "The frames that serve, for the controller; null without a maker."
     ]
     output: Annotated[str | None, "The file that was written."]
     warnings: Texts

@@ -68,6 +68,21 @@ def test_a_moved_fixture_is_told_and_written_for_a_controller(folder, capsys):
     assert document["text"].startswith(f"$BASE={{X {x:.4f},")
 
 
+def test_a_frame_that_is_not_accepted_is_not_written_for_a_controller(folder, capsys):
+    taught, kuka = ("--taught", "fixture_taught.csv"), ("--maker", "kuka")
+    before = command(capsys, "--points", "fixture_taught.csv", *kuka)[1]["text"]
+    document = command(capsys, "--points", "fixture_knocked.csv", *taught, *kuka)[1]
+    assert document["verdict"]["code"] == "SENSOR_OR_ROBOT_MOVED"
+    assert document["text"] == before
+    x = document["frame"]["xyz_mm"][0]
+    assert not before.startswith(f"$BASE={{X {x:.4f},")
+    main(["fixture", *ROBOT, "--points", "fixture_knocked.csv", *taught, *kuka])
+    assert f"The frame stays as it is:\n{before}\n" in capsys.readouterr().out
+    refused = ("--points", "fixture_taught.csv", "--form-mm", "0.001")
+    document = command(capsys, *refused, *kuka)[1]
+    assert (document["verdict"]["code"], document["text"]) == ("RESIDUAL_TOO_LARGE", None)
+
+
 def test_taught_kept_accepted_and_compared_with_what_is_in_force(folder, capsys):
     kept = ("--robot-serial", "R1", "--state", str(folder))
     with CalibrationHistory.open("R1", model_hash=ARM.model_hash, state_dir=folder):

@@ -358,6 +358,10 @@ def test_a_shift_is_kept_verified_and_rolled_back(cell):
     _, again = shift()
     assert again["verdict"]["code"] == "NO_SIGNIFICANT_GAIN"
     assert again["in_force"]["rms_mm"] == pytest.approx(first["after"]["rms_mm"], rel=1e-9)
+    # what serves no better is not printed: the frames in force are
+    _, tool = shift("--parts", "tool")
+    assert tool["verdict"]["code"] == "NO_SIGNIFICANT_GAIN"
+    assert tool["text"] == first["text"].splitlines()[0]
     _, printed = shift("--in-force")
     assert printed["text"] == first["text"]
     assert printed["verdict"]["accept"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fixture's file, and tables of its points: when it was taught, and once it has moved."""
+"""A fixture's file, and tables of its points: taught, and once it or the sensor has moved."""
 
 from pathlib import Path
 
@@ -18,6 +18,7 @@ def fixture_tables(folder: Path) -> None:
     (folder / "plate.yaml").write_text(yaml.safe_dump(fixture_document(PLATE)))
     _table(folder / "fixture_taught.csv", cell.points(cell.faults(), 3, 1))
     _table(folder / "fixture_now.csv", cell.points(cell.faults("fixture_moved", MOVED_M), 2, 2))
+    _table(folder / "fixture_knocked.csv", cell.points(cell.faults("sensor_knocked", 1e-3), 2, 2))
 
 
 def _table(path: Path, points: FixturePoints) -> None:
