@@ -43,9 +43,10 @@ _DECLARED = re.compile(
 )
 _ASSIGNED = re.compile(r"(?:^|[;\n])\s*(?P<name>\w+)\s*(?:\{[^}]*\})?\s*:=\s*(?=\[)")
 _SET = re.compile(r"(?<![\\.\w])(\w+)\s*:=")
-_MOVES = re.compile(
-    r"\b((?:Move|Trigg|Arc|Spot|Search|Paint|Disp)\w*)\b([^;:]*(?::=[^;:]*)*);", re.I
-)
+_MOTION = r"(?:Move|Trigg|Arc|Spot|Search|Paint|Disp)\w*"
+# A name that begins so (SearchOk, MODULE MoveParts) does not reach into the instruction behind it.
+_ARGUMENTS = rf"(?:(?!(?<=[^\s,=(])\s+{_MOTION}(?:\s+\w|\s*\[|\s*\\\s*\w+\s*,))[^;:])*"
+_MOVES = re.compile(rf"\b({_MOTION})\b(?!\s*\()({_ARGUMENTS}(?::={_ARGUMENTS})*);", re.I)
 _PLAIN = {"movej": 1, "movel": 1, "movec": 2, "moveabsj": 1}
 _TOOL_LAST = re.compile(r"Move(?:[JLC]|AbsJ)|(?:Trigg|Search|Arc|Spot|Paint|Disp)\w*", re.I)
 _BY_JOINTS = re.compile(r"(?:Move|Trigg|Spot|Paint)J", re.I)

@@ -263,6 +263,33 @@ def test_a_motion_says_its_tool_wherever_that_is_declared(motion, tool, frame):
 
 
 @pytest.mark.parametrize(
+    ("text", "tool"),
+    [
+        ("PROC MoveHome()\n{};\nENDPROC", "tgun"),
+        ("PROC ArcPath()\n{};\nENDPROC\nPROC B ()\n{};\nENDPROC", "tgun"),
+        ("PROC MovePick()\n{};\nENDPROC\nPROC B()\nMoveL p1,v9,z1,tB;\nENDPROC", None),
+        ("MODULE MoveParts\nPROC B()\n{};\nENDPROC\nENDMODULE", "tgun"),
+        ("IF SearchOk THEN\n{};\nENDIF", "tgun"),
+        ("IF SearchOk=TRUE AND i>2 {};", "tgun"),
+        ("IF SearchOk THEN\nMoveJ\\Conc,p1,v9,z1,tGun;\nENDIF", "tgun"),
+        ("TEST n\nCASE SpotA: {};\nENDTEST", "tgun"),
+        ("MoveSafe;\nSearchCount:=0;\n{};", "tgun"),
+        ("SearchL\\Stop,searchSig\\Flanks,pFound,p1,v9,tGun;", "tgun"),
+        ("MoveJ p1,\n  moveSpeed,moveZone \\Inpos:=i,\n  tGun;", "tgun"),
+    ],
+)
+def test_a_name_that_begins_as_a_motion_hides_none_behind_it(text, tool):
+    target = "[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    motion = "MoveL p1,v9,fine,tGun"
+    module = f"CONST robtarget p1:={target};\n" + text.replace("{}", motion) + "\n"
+    (point,) = dialect_of(".mod").read(module).points
+    assert point.tool == tool
+    literal = text.replace("{}", motion).replace("p1", target)
+    points = dialect_of(".mod").read(literal + "\n").points
+    assert len(points) == literal.count(target)
+
+
+@pytest.mark.parametrize(
     ("switch", "motion", "followed"),
     [
         ("ConfL\\Off;", "MoveL", False),
