@@ -64,7 +64,8 @@ _DECLARED = re.compile(
 _FDAT = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{([^{}]*)\}", re.I)
 _FRAME_DATA = re.compile(r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\]\s*=\s*\{([^{}]*)\}", re.I)
 _SET = re.compile(
-    r"\$(?P<kind>TOOL|BASE)(?P<part>\.\w+)?\s*=(?!=)\s*(?P<value>\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?[^\r\n;]*)"
+    r"\$(?P<kind>TOOL|BASE)(?P<part>\.\w+)?\s*=(?!=)\s*"
+    r"(?P<value>(?:\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?)[^\r\n;]*)"
     r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)"
     r"|^[ \t]*(?:GLOBAL\s+)?(?P<routine>DEF(?:FCT)?)\b",
     re.I | re.M,
@@ -74,12 +75,18 @@ _WITH = re.compile(
     re.I | re.M,
 )
 _END_OF_BLOCK = re.compile(r"^[ \t]*ENDSPLINE\b", re.I | re.M)
-_COMPUTED = re.compile(rf"\b{MOVES}(?:_REL)?\b[^\r\n{{}}]*(?:\w\s*:\s*[\w{{$]|\w\()[^\r\n]*", re.I)
+# Of A:B frame B is given in A: a motion goes neither to A nor to B. {POS: X 1,…} names a type.
+_OPERAND = re.compile(r"\{\s*\w+[ \t]*:|:[ \t]*(\w+(?:\[\d+\])?)")
+_OPERATOR = re.compile(r"[ \t]*:")
+_REST = r"(?:[^\r\n{}]|\{[^{}\r\n]*\})*?"
+_PRODUCT = rf"{_REST}(?:[\w\])]|\{{[^{{}}\r\n]*\}})[ \t]*:[ \t]*[\w{{$]"
+_COMPUTED = re.compile(rf"\b{MOVES}(?:_REL)?\b(?:{_PRODUCT}|{_REST}\w\()[^\r\n]*", re.I)
 _CHANGED = re.compile(
-    r"\b(?:TOOL|BASE)_DATA\[[^\]\r\n]*\](?:\.\w+)?\s*=(?![\s=]*\{)[^\r\n]*"
+    rf"^[ \t]*[A-Z]\w*(?:\[[^\]\r\n]*\])?\s*=(?!=){_PRODUCT}[^\r\n]*"
+    r"|\b(?:TOOL|BASE)_DATA\[[^\]\r\n]*\](?:\.\w+)?\s*=(?![\s=]*\{)[^\r\n]*"
     r"|\$(?:TOOL|BASE)\.\w+\s*=(?!=)[^\r\n]*"
     r"|(?<![$\w])[A-Z]\w*(?:\[[^\]\r\n]*\])?\.(?:[XYZABC]|A[1-6])\s*=(?!=)[^\r\n]*",
-    re.I,
+    re.I | re.M,
 )
 
 
@@ -104,12 +111,20 @@ class KrlDialect(Dialect):
         used |= {name.partition("[")[0] for name in used if not _NUMBERED.search(name)}
         for found in _DECLARED.finditer(clean):  # an array's points are assigned one by one
             used |= set(re.findall(r"\w+", re.sub(r"\[[^\]]*\]", "", found[1].upper())))
+        reckoned: dict[str, int] = {}
+        for found in _OPERAND.finditer(clean):
+            if found[1] and (name := found[1].upper()) not in reckoned:
+                reckoned[name] = line_of(text, found.start())
         points: list[ProgramPoint] = []
         for braces in _BRACES.finditer(clean):
             point = _point(text, clean, braces, used)
             if point is None:
                 continue
             point = _framed(point, braces.start(), inline, set_above)
+            name = point.name.upper()
+            if line := reckoned.get(name, reckoned.get(name.partition("[")[0])):
+                problem = f"the program reckons with it in line {line}"
+                point = replace(point, problem=point.problem or problem)
             points.append(replace(point, order=len(points)))
         computed = tuple(
             (line_of(text, found.start()), text[found.start() : found.end()].strip())
@@ -167,6 +182,8 @@ def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> Prog
     joints = "A1" in parts and "X" not in parts
     names = AXES if joints else POSE
     before = clean[clean.rfind("\n", 0, braces.start()) + 1 : braces.start()]
+    if before.rstrip().endswith(":") or _OPERATOR.match(clean, braces.end()):
+        return None
     assigned, moved = _ASSIGNED.search(before), _MOVED.search(before)
     line = line_of(text, braces.start())
     if assigned:
@@ -259,7 +276,7 @@ def _given(line: int, found: re.Match[str], frames: dict[str, Array]) -> dict[st
         return {kind: f"{kind}_DATA[{number}]" if number.isdigit() else f"${kind}{here}"}
     kind, value = found["kind"].upper(), found["value"].strip()
     name = f"${kind}{here}"
-    T = _frame(value[1:-1]) if value.startswith("{") else None
+    T = _frame(value[1:-1]) if re.fullmatch(r"\{[^{}]*\}", value) else None
     if T is not None:
         frames[name] = T
     elif not found["part"] and re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):

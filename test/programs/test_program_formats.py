@@ -174,6 +174,47 @@ def test_what_a_program_changes_itself_is_told():
 POINT = "{X 1,Y 2,Z 3,A 0,B 0,C 0}"
 
 
+@pytest.mark.parametrize(
+    ("lines", "points", "computed"),
+    [
+        (f"PTP XTC:{POINT}", {}, [3]),
+        (f"LIN {POINT}:XP1", {}, [3]),
+        (f"LIN {POINT} : {POINT}", {}, [3]),
+        (f"LIN_REL {POINT}:XP1", {}, [3]),
+        (
+            f"DECL POS OFFS={POINT}\nDECL E6POS XP1={POINT}\nLIN XP1:OFFS",
+            {"OFFS": "the program reckons with it in line 5", "XP1": ""},
+            [5],
+        ),
+        (
+            f"DECL POS P[2]\nP[1]={POINT}\nP[2]={POINT}\nLIN XP1:P[2]",
+            {"P[1]": "", "P[2]": "the program reckons with it in line 6"},
+            [6],
+        ),
+        (
+            f"DECL POS P[1]\nP[1]={POINT}\nLIN F[I]:P[I]",
+            {"P[1]": "the program reckons with it in line 5"},
+            [5],
+        ),
+        (f"DECL POS XP2\nXP2={POINT}:XP1\nXP2=XP1:{POINT}", {}, [4, 5]),
+        ("DECL POS XP2={POS: X 1,Y 2,Z 3,A 0,B 0,C 0}\nLIN XP2", {"XP2": ""}, []),
+    ],
+)
+def test_an_operand_of_the_geometric_operator_is_no_point(lines, points, computed):
+    text = f"$TOOL=TOOL_DATA[1]\n$BASE=BASE_DATA[1]\n{lines}\n"
+    found = dialect_of(".src").read(text)
+    assert {point.name: point.problem for point in found.points} == points
+    assert [line for line, _ in found.computed] == computed
+
+
+def test_a_base_that_is_a_product_is_unknown():
+    place = "{X 100,Y 0,Z 0,A 0,B 0,C 0}"
+    for value in (f"{place}:BASE_DATA[2]", f"BASE_DATA[2]:{place}", f"{place} : {place}"):
+        found = dialect_of(".src").read(f"$BASE={value}\nLIN {POINT}\n")
+        assert [point.frame for point in found.points] == ["$BASE of line 1"]
+        assert "$BASE of line 1" not in found.frames
+
+
 def test_what_with_sets_holds_for_its_motion_or_block_alone():
     """As inline forms of KSS 8 write it; SVEL_CP( ) and its like make no point."""
     krl = (
