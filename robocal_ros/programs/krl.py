@@ -5,7 +5,7 @@
     DECL FDAT FP1={TOOL_NO 1,BASE_NO 2,IPO_FRAME #BASE,…}
 
 Of a point of an inline form (XP1) the frames are in FP1; elsewhere those that were set last above
-in its routine, or by the WITH of its motion or spline block.
+in its routine, by FDAT_ACT too, or by the WITH of its motion or spline block.
 Sources are in docs/programs.md.
 """
 
@@ -61,12 +61,14 @@ _USED = re.compile(rf"\b{MOVES}\s+(\w+(?:\[\w+\])?)(?:\s*,\s*(\w+(?:\[\w+\])?))?
 _DECLARED = re.compile(
     r"\b(?:E6POS|POS|E6AXIS|AXIS)\s+((?:\w+(?:\[[^\]\r\n]*\])?[ \t]*,?[ \t]*)+)", re.I
 )
-_FDAT = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{([^{}]*)\}", re.I)
+_FDAT = re.compile(r"\bFDAT\s+(\w+)\s*=\s*\{([^{}]*)\}", re.I)
 _FRAME_DATA = re.compile(r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\]\s*=\s*\{([^{}]*)\}", re.I)
 _SET = re.compile(
     r"\$(?P<kind>TOOL|BASE)(?P<part>\.\w+)?\s*=(?!=)\s*"
     r"(?P<value>(?:\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?)[^\r\n;]*)"
     r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)"
+    r"|^[ \t]*FDAT_ACT(?:\.\w+)?\s*=(?!=)\s*(?P<fdat>\{[^{}]*\}|[^\r\n]*)"
+    r"|\$IPO_MODE\s*=(?!=)\s*(?P<mode>#?\w+)"
     r"|^[ \t]*(?:GLOBAL\s+)?(?P<routine>DEF(?:FCT)?)\b",
     re.I | re.M,
 )
@@ -106,7 +108,7 @@ class KrlDialect(Dialect):
             if T is not None:
                 frames[f"{found[1].upper()}[{found[2]}]"] = T
         inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
-        set_above = list(_settings(text, clean, frames))
+        set_above = list(_settings(text, clean, frames, inline))
         used = {name.upper() for found in _USED.finditer(clean) for name in found.groups() if name}
         used |= {name.partition("[")[0] for name in used if not _NUMBERED.search(name)}
         for found in _DECLARED.finditer(clean):  # an array's points are assigned one by one
@@ -240,7 +242,7 @@ def _posture(parts: dict[str, Field]) -> Posture:
 
 @dataclass(frozen=True)
 class _Set:
-    """Tool or base, None where it is not known, from a place on; ``until``: of a WITH its end."""
+    """Tool, base and IPO mode as of `_given`, from a place on; ``until``: of a WITH its end."""
 
     at: int
     names: dict[str, str | None]
@@ -252,25 +254,35 @@ def _without(clean: str) -> str:
     return _WITH.sub(lambda found: found["motion"].ljust(len(found[0])), clean)
 
 
-def _settings(text: str, clean: str, frames: dict[str, Array]) -> Iterator[_Set]:
+def _settings(
+    text: str, clean: str, frames: dict[str, Array], inline: dict[str, str]
+) -> Iterator[_Set]:
     """What is set, in the order of the text, then what a WITH sets, which goes before it."""
     for found in _SET.finditer(_without(clean)):
-        yield _Set(found.start(), _given(line_of(text, found.start()), found, frames))
+        yield _Set(found.start(), _given(line_of(text, found.start()), found, frames, inline))
     for found in _WITH.finditer(clean):
         end = _END_OF_BLOCK.search(clean, found.end()) if found["block"] else None
         until = end.start() if end else found.end()
         for part in arguments(clean, found.end("motion"), found.end()):
             if given := _SET.match(part.text):
-                names = _given(line_of(text, part.start), given, frames)
+                names = _given(line_of(text, part.start), given, frames, inline)
                 if None not in names.values():
                     yield _Set(found.start(), names, until)
 
 
-def _given(line: int, found: re.Match[str], frames: dict[str, Array]) -> dict[str, str | None]:
-    """Tool or base that a place in the text sets; None: not known from it on."""
+def _given(
+    line: int, found: re.Match[str], frames: dict[str, Array], inline: dict[str, str]
+) -> dict[str, str | None]:
+    """Tool or base that a place in the text sets, None: not known from it on; IPO: #TCP or not."""
     if found["routine"] or (found["bas"] or "").upper() == "INITMOV":
-        return {"TOOL": None, "BASE": None}
+        return {"TOOL": None, "BASE": None, "IPO": None}
     here = f"{OF_LINE}{line}"  # of what is not read here: unknown
+    if found["mode"]:
+        return {"IPO": found["mode"].upper()}
+    if found["fdat"] is not None:  # for the BAS(#FRAMES) behind it
+        word = found["fdat"].strip()
+        body = word[1:-1] if word.startswith("{") else inline.get(word.upper(), "")
+        return _of_fdat(body, here)
     if found["bas"]:
         kind, number = found["bas"].upper(), found["number"].strip()
         return {kind: f"{kind}_DATA[{number}]" if number.isdigit() else f"${kind}{here}"}
@@ -284,25 +296,29 @@ def _given(line: int, found: re.Match[str], frames: dict[str, Array]) -> dict[st
     return {kind: name}
 
 
+def _of_fdat(body: str, here: str) -> dict[str, str | None]:
+    """What the components of an FDAT set; ``here``: behind the name of what they leave out."""
+    parts = {name: part.text.strip().upper() for name, part in _parts(body, 0).items()}
+    names: dict[str, str | None] = {"IPO": parts.get("IPO_FRAME")}
+    for kind in ("TOOL", "BASE"):
+        number = parts.get(f"{kind}_NO")
+        names[kind] = f"${kind}{here}" if number is None else f"{kind}_DATA[{number}]"
+    return names
+
+
 def _framed(
     point: ProgramPoint, at: int, inline: dict[str, str], set_above: list[_Set]
 ) -> ProgramPoint:
     """The point with the names of its frames, and what about them forbids a correction."""
-    body = inline.get(point.name.upper().removeprefix("X"))
-    if body is not None:
-        parts = _parts(body, 0)
-        tool, base = (parts.get(name) for name in ("TOOL_NO", "BASE_NO"))
-        if "IPO_FRAME" in parts and parts["IPO_FRAME"].text.strip().upper() == "#TCP":
-            return replace(
-                point, problem=point.problem or "the robot carries the part to a tool that stands"
-            )
-        return replace(
-            point,
-            tool=None if tool is None else f"TOOL_DATA[{tool.text.strip()}]",
-            frame=None if base is None else f"BASE_DATA[{base.text.strip()}]",
-        )
     names: dict[str, str | None] = {}
-    for one in set_above:
-        if one.at <= at < one.until:
-            names |= one.names
+    body = inline.get("F" + point.name.upper().removeprefix("X"))
+    if body is not None:
+        names = _of_fdat(body, f"{OF_LINE}{point.line}")
+    else:
+        for one in set_above:
+            if one.at <= at < one.until:
+                names |= one.names
+    if names.get("IPO") == "#TCP":
+        words = "the robot carries the part to a tool that stands"
+        return replace(point, problem=point.problem or words)
     return replace(point, tool=names.get("TOOL"), frame=names.get("BASE"))

@@ -234,6 +234,38 @@ def test_what_with_sets_holds_for_its_motion_or_block_alone():
     assert found.computed == ()
 
 
+def test_frames_that_are_set_by_fdat_act():
+    """As off-line programs set them, and inline forms where these are unfolded."""
+    krl = (
+        "DECL FDAT FP1={TOOL_NO 3,BASE_NO 4,IPO_FRAME #BASE}\nDECL FDAT FP2={TOOL_NO 5,BASE_NO 5,"
+        "IPO_FRAME #TCP}\nDECL FDAT FDAT_ACT={TOOL_NO 9,BASE_NO 9,IPO_FRAME #NONE}\n"
+        f"LIN {POINT}\nBAS(#TOOL,1)\nBAS(#BASE,1)\n"
+        "FDAT_ACT = {TOOL_NO 6,BASE_NO 2,IPO_FRAME #BASE}\nBAS (#FRAMES)\n"
+        f"LIN {POINT}\nFDAT_ACT=FP1\nBAS(#PTP_PARAMS,100)\nLIN {POINT}\n"
+        f"FDAT_ACT=FP7\nBAS(#FRAMES)\nLIN {POINT}\nFDAT_ACT=FP2\nLIN {POINT}\n"
+        f"BAS(#TOOL,1)\nBAS(#BASE,1)\nLIN {POINT}\nFDAT_ACT=FP1\nLIN {POINT}\n"
+    )
+    points = dialect_of(".src").read(krl).points
+    frames = [(point.tool, point.frame) for point in points]
+    assert frames[:3] == [
+        (None, None), ("TOOL_DATA[6]", "BASE_DATA[2]"), ("TOOL_DATA[3]", "BASE_DATA[4]"),
+    ]  # fmt: skip
+    assert frames[3] == ("$TOOL of line 13", "$BASE of line 13")  # of another file
+    assert ["stands" in point.problem for point in points[4:]] == [True, True, False]
+
+
+def test_a_robot_that_carries_the_part_as_its_ipo_mode_says():
+    krl = (
+        f"DEF A()\n$IPO_MODE=#TCP\n$TOOL=TOOL_DATA[1]\n$BASE=BASE_DATA[1]\nLIN {POINT}\n"
+        f"SLIN {POINT} WITH $IPO_MODE=#BASE\n$IPO_MODE=#BASE\nLIN {POINT}\n"
+        f"SLIN {POINT} WITH $IPO_MODE=#TCP\nLIN {POINT}\n$IPO_MODE=#TCP\nEND\n"
+        f"DEF B()\nLIN {POINT}\nEND\n"
+    )
+    points = dialect_of(".src").read(krl).points
+    stands = ["stands" in point.problem for point in points]
+    assert stands == [True, False, False, True, False, False]
+
+
 def test_a_routine_does_not_have_the_frames_of_the_one_above():
     """It has those of its caller, which the order of the text does not tell."""
     krl = "DEF A()\n$BASE=BASE_DATA[1]\nB()\n$BASE=BASE_DATA[2]\nEND\n"
