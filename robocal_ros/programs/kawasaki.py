@@ -54,7 +54,7 @@ _STEP = re.compile(
     r"^[ \t]*(?:\d+[ \t]+)?(?:JOINT|LINEAR|FLIN|CIR1|CIR2)\b[^\r\n]*?#\[([^\]\r\n]*)\]", re.M
 )
 _MOTION = re.compile(
-    r"\b(?:J|L|X|H|FL|C1|C2)MOVE\b[ \t]*([^\r\n]*)|\b(?:J|L)APPRO\b[ \t]*([^\r\n]*)", re.I
+    r"\b(?:(?:J|L|X|H|FL|C1|C2)MOVE|[JL]APPRO|(?:J|L|C1|C2)W[SCE])\b[ \t]*([^\r\n]*)", re.I
 )
 _SET = re.compile(r"^[ \t]*(BASE|TOOL)[ \t]+([^\r\n]+)", re.M | re.I)
 _TRANS = re.compile(r"TRANS[ \t]*\(", re.I)
@@ -132,9 +132,8 @@ def _used(
     goals: set[int] = set()
     settings, set_up = deque(_SET.finditer(clean, *span)), dict[str, str]()
     for found in _MOTION.finditer(clean, *span):
-        group = 1 if found[1] is not None else 2
-        target = arguments(clean, found.start(group), found.end(group))[0]
-        name = target.text.strip()
+        target = arguments(clean, found.start(1), found.end(1))[0]
+        name = re.split(r"\s+TILL\b", target.text, flags=re.I)[0].strip()
         if not name:
             continue
         if not _TOKEN.fullmatch(name):

@@ -31,10 +31,13 @@ from robocal_ros.programs.points import (
     require_numbers,
 )
 
-TARGETS = {"movej": 1, "movel": 1, "movep": 1, "movec": 2, "servoj": 1, "servoc": 1}
+TARGETS = {
+    "movej": 1, "movel": 1, "movep": 1, "movec": 2, "servoj": 1, "servoc": 1,
+    "optimovej": 1, "optimovel": 1,
+}  # fmt: skip
 BASE, TCP = "base", "tcp"
 
-_CALL = re.compile(r"\b(movej|movel|movep|movec|servoj|servoc|set_tcp)\s*(?=\()")
+_CALL = re.compile(rf"\b({'|'.join(TARGETS)}|set_tcp)\s*(?=\()")
 _ASSIGNED = re.compile(r"\b(\w+)\s*=\s*(?=p?\[)")
 _LIST = re.compile(r"p?\s*(?=\[)")
 _COMPUTED = re.compile(r"\b(pose_trans|pose_add|pose_sub|interpolate_pose)\s*\(")

@@ -398,6 +398,14 @@ def test_urscript_with_named_arguments_and_targets_that_are_not_read():
     assert found.computed == ((3, "l[0]"),)
 
 
+def test_points_of_optimised_motions_of_urscript():
+    script = "A_p=p[.4,-.3,.2,0,3.1,0]\noptimovel(A_p, a=.3, v=.3)\noptimovej([0,1,2,3,4,5])\n"
+    found = dialect_of(".script").read(script)
+    assert [(point.name, point.joints) for point in found.points] == [
+        ("A_p", False), ("line 3", True),
+    ]  # fmt: skip
+
+
 def test_krl_with_a_tool_that_stands_and_an_exact_robot():
     text = (
         "DECL E6POS XP1={X 1,Y 2,Z 3,A 0,B 0,C 0,S 18,T 2}\n"
@@ -650,6 +658,18 @@ def test_as_programs_and_their_locations():
     assert len(words["#e"].fields) == 6  # what is behind them is an external axis
     assert found.computed == ((9, "fix+d"), (11, "row[.i]"), (20, "there"))
     assert "ABOVE" in found.notes[0]
+
+
+def test_points_of_weld_motions_and_of_motions_up_to_a_signal():
+    moves = ("JMOVE a", "XMOVE b TILL 1001", "LWS c,1", "LWC d,1", "C1WC e,1", "C2WE f, 1")
+    lines = "\n ".join(("TOOL NULL", "BASE NULL", *moves))
+    rows = "\n".join(f"{name} 1 2 3 0 0 0" for name in "abcdef")
+    found = dialect_of(".as").read(f".PROGRAM m()\n {lines}\n.END\n.TRANS\n{rows}\n.END\n")
+    assert [point.name for point in found.points] == [*"abcdef"]
+    assert {(point.tool, point.frame, point.problem) for point in found.points} == {
+        ("NULL", "NULL", "")
+    }
+    assert found.computed == ()
 
 
 def test_a_file_of_locations_alone_has_them_all():
