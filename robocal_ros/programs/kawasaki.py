@@ -58,7 +58,8 @@ _MOTION = re.compile(
 )
 _SET = re.compile(r"^[ \t]*(BASE|TOOL)[ \t]+([^\r\n]+)", re.M | re.I)
 _TRANS = re.compile(r"TRANS[ \t]*\(", re.I)
-_POINT = re.compile(rf"^[ \t]*POINT[ \t]+({_NAME})[ \t]*=[ \t]*([^\r\n]*)", re.M | re.I)
+_POINT = re.compile(rf"^[ \t]*POINT(?:/\w+)?[ \t]+({_NAME})[ \t]*=[ \t]*([^\r\n]*)", re.M | re.I)
+_HERE = re.compile(rf"\bHERE[ \t]+({_NAME})", re.I)
 _TOKEN = re.compile(_NAME)
 _POSTURE = re.compile(r"^[ \t]*(LEFTY|RIGHTY|ABOVE|BELOW|UWRIST|DWRIST)\b", re.M | re.I)
 
@@ -97,13 +98,22 @@ class KawasakiDialect(Dialect):
         for name in values:
             if "[" in name:
                 arrays.setdefault(name.split("[")[0], []).append(name)
+        set_here = {
+            found[1].lower().split("[")[0]
+            for span in programs
+            for pattern in (_POINT, _HERE)
+            for found in pattern.finditer(clean, *span)
+        }
+        constants = {
+            name: row for name, row in values.items() if name.split("[")[0] not in set_here
+        }
         frames: dict[str, Array] = {NULL: np.eye(4)}
         uses = {name: _Use() for name in values}
         points: list[ProgramPoint] = []
         computed: list[tuple[int, str]] = []
-        for start, end in programs:
-            computed += _used(text, clean, (start, end), values, frames, uses, arrays)
-            points += _steps(text, clean, start, end)
+        for span in programs:
+            computed += _used(text, clean, span, constants, frames, uses, arrays)
+            points += _steps(text, clean, *span)
         for found in located:
             use = uses[found[1].lower()]
             if use.moved or not programs:
@@ -122,12 +132,15 @@ def _used(
     text: str,
     clean: str,
     span: tuple[int, int],
-    values: Mapping[str, "re.Match[str]"],
+    constants: Mapping[str, "re.Match[str]"],
     frames: dict[str, Array],
     uses: Mapping[str, _Use],
     arrays: Mapping[str, Sequence[str]],
 ) -> list[tuple[int, str]]:
-    """Note what one program does with each location; the places where it makes points itself."""
+    """Note what one program does with each location; the places where it makes points itself.
+
+    ``constants``: locations that no program sets, by name.
+    """
     computed = []
     goals: set[int] = set()
     settings, set_up = deque(_SET.finditer(clean, *span)), dict[str, str]()
@@ -138,9 +151,9 @@ def _used(
             continue
         if not _TOKEN.fullmatch(name):
             computed.append((target.start, name))
-        elif name.lower() in values:
+        elif name.lower() in uses:
             while settings and settings[0].start() < target.start:
-                _set_up(text, clean, settings.popleft(), values, frames, set_up)
+                _set_up(text, clean, settings.popleft(), constants, frames, set_up)
             goals.add(target.start)
             use = uses[name.lower()]
             use.goals.append(target.start)
@@ -153,10 +166,10 @@ def _used(
         computed.append((found.start(1), f"POINT {found[1]} = {found[2].strip()}"))
     for token in _TOKEN.finditer(clean, *span):
         name = token[0].lower()
-        if name in values and token.start() not in goals:
+        if name in uses and token.start() not in goals:
             use = uses[name]
             use.other = token.start() if use.other is None else use.other
-        elif "[" in name and name not in values:
+        elif "[" in name and name not in uses:
             _note_array(name, token.start(), uses, arrays)
     return computed
 
@@ -179,7 +192,7 @@ def _set_up(
     text: str,
     clean: str,
     setting: "re.Match[str]",
-    values: Mapping[str, "re.Match[str]"],
+    constants: Mapping[str, "re.Match[str]"],
     frames: dict[str, Array],
     set_up: dict[str, str],
 ) -> None:
@@ -188,17 +201,17 @@ def _set_up(
     name = f"{kind}{OF_LINE}{line_of(text, setting.start())}"
     if word.upper() == NULL:
         name = NULL
-    elif (T := _constant(clean, setting.start(2), setting.end(2), values)) is not None:
+    elif (T := _constant(clean, setting.start(2), setting.end(2), constants)) is not None:
         frames[name] = T
     set_up[kind] = name
 
 
 def _constant(
-    clean: str, start: int, end: int, values: Mapping[str, "re.Match[str]"]
+    clean: str, start: int, end: int, constants: Mapping[str, "re.Match[str]"]
 ) -> Array | None:
-    """A transformation that is written out, or the location of that name; None: reckoned."""
+    """A transformation that is written out, or the constant of that name; None: reckoned."""
     word = clean[start:end].strip()
-    located = values.get(word.lower())
+    located = constants.get(word.lower())
     if located is not None and not word.startswith("#"):
         given = [part.value for part in _numbers(located)[:AXES]]
     else:

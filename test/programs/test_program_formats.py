@@ -672,6 +672,25 @@ def test_points_of_weld_motions_and_of_motions_up_to_a_signal():
     assert found.computed == ()
 
 
+@pytest.mark.parametrize(
+    ("line", "constant"),
+    [
+        ("POINT gun = gun+TRANS(0,0,dz)", False),
+        ("POINT/OAT gun = far", False),
+        ("HERE gun", False),
+        ("POINT far = gun", True),
+        ("d = DISTANCE(gun,far)", True),
+    ],
+)
+def test_a_tool_that_the_program_sets_itself_is_unknown(line, constant):
+    """Also where another program sets it."""
+    rows = ".TRANS\na 500 0 300 0 180 0\ngun 0 0 250 0 0 0\nfar 1 2 3 0 0 0\n.END\n"
+    text = f".PROGRAM m()\n TOOL gun\n LMOVE a\n.END\n.PROGRAM set()\n {line}\n.END\n{rows}"
+    found = dialect_of(".as").read(text)
+    assert found.points[0].tool == "TOOL of line 2"
+    assert ("TOOL of line 2" in found.frames) is constant
+
+
 def test_a_file_of_locations_alone_has_them_all():
     found = dialect_of(".lc").read(AS[AS.index(".TRANS") :])
     assert [point.name for point in found.points] == [
