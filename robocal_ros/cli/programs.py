@@ -521,8 +521,10 @@ def _as_they_are(models: CorrectionModels, work: ShiftedWork) -> FrameShift:
 
 def _shifted_text(args: argparse.Namespace, shift: FrameShift, T_first: Array) -> str:
     """The frames that the controller has as shifted; ``T_first`` (4, 4): the tool of the poses."""
-    tools = [frame_given(args.maker, given) for given in args.tool] or [("", T_first)]
-    bases = [frame_given(args.maker, given) for given in args.base] or [("", np.eye(4))]
+    # of FANUC six numbers alone do not tell what they are
+    tool, base = ("UTOOL", "UFRAME") if args.maker == "fanuc" else ("", "")
+    tools = [frame_given(args.maker, given) for given in args.tool] or [(tool, T_first)]
+    bases = [frame_given(args.maker, given) for given in args.base] or [(base, np.eye(4))]
     lines = []
     if "tool" in args.parts:
         # the shift is that of its axes; others move with the flange

@@ -108,13 +108,13 @@ def tool_text(maker: Maker, T_flange_tool: Array, name: str = "", load: Load | N
     """A tool (4, 4) for a controller; ``name`` as it has it, ``load`` for ABB."""
     if maker == "kuka":
         return f"{name or '$TOOL'}={_frame_text(maker, T_flange_tool)}"
-    if maker == "ur":
-        return f"set_tcp({_frame_text(maker, T_flange_tool)})"
-    if maker == "kawasaki":
-        return f"TOOL {_frame_text(maker, T_flange_tool)}"
     frame = _frame_text(maker, T_flange_tool)
+    if maker == "ur":
+        return f"set_tcp({frame})" + (f"  # {name}" if name else "")
+    if maker == "kawasaki":
+        return f"TOOL {frame}{_remark(name)}"
     if maker == "fanuc":
-        return frame
+        return f"{name}:\n{frame}" if name else frame
     weight, remark = ABB_UNKNOWN, ABB_REMARK
     if load is not None:
         centre = ",".join(fixed(np.array(load.centre) * 1e3, 3))
@@ -132,7 +132,13 @@ def base_text(maker: Maker, T_base_frame: Array, name: str = "") -> str:
     if maker == "ur":
         name = name or "base"
         return f"# no base can be set: go to pose_trans({name}, p) in place of p\n{name}={frame}"
-    return f"BASE {frame}" if maker == "kawasaki" else frame
+    if maker == "kawasaki":
+        return f"BASE {frame}{_remark(name)}"
+    return f"{name}:\n{frame}" if name else frame
+
+
+def _remark(name: str) -> str:
+    return f" ; {name}" if name else ""
 
 
 def _frame_text(maker: Maker, T: Array) -> str:

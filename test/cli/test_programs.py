@@ -286,7 +286,7 @@ def frames_of(document: dict) -> np.ndarray:
     [
         ("kuka", ["$TOOL={X ", "$BASE={X "]),
         ("abb", ["! mass", "PERS tooldata tcp:=[TRUE,[[", "PERS wobjdata wobj:=[FALSE,TRUE,"]),
-        ("fanuc", ["X ", "W ", "X ", "W "]),
+        ("fanuc", ["UTOOL:", "X ", "W ", "UFRAME:", "X ", "W "]),
         ("ur", ["set_tcp(p[", "# no base", "base=p["]),
         ("kawasaki", ["TOOL TRANS(", "BASE TRANS("]),
     ],
@@ -300,6 +300,20 @@ def test_each_maker_has_its_own_text(work: Path, capsys, maker, lines):
     assert alone["T_base_shift"]["xyz_mm"] == [0.0, 0.0, 0.0]
     warned = any("factory calibration" in words for words in document["warnings"])
     assert warned == (maker == "ur")  # the robot file is a nominal one
+
+
+@pytest.mark.parametrize(
+    ("maker", "pattern"),
+    [
+        ("fanuc", r"UT3:\nX [^:]*\nUT4:\nX [^:]*\nUF5:\nX [^:]*"),
+        ("ur", r"set_tcp\(.*\)  # UT3\nset_tcp\(.*\)  # UT4\n# no base .*\nUF5=p.*"),
+        ("kawasaki", r"TOOL TRANS\(.*\) ; UT3\nTOOL TRANS\(.*\) ; UT4\nBASE TRANS\(.*\) ; UF5"),
+    ],
+)
+def test_each_frame_is_told_by_its_name(work: Path, capsys, maker, pattern):
+    tools = ("--tool", "UT3=0,0,0,0,0,0", "--tool", "UT4=0,0,0,0,0,0")
+    _, document = shifted(capsys, "--maker", maker, *tools, "--base", "UF5=0,0,0,0,0,0")
+    assert re.fullmatch(pattern, document["text"])
 
 
 def test_weights_are_taken_from_the_table(work: Path, capsys):
