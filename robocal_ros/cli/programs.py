@@ -232,7 +232,7 @@ def add_correct_program(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="further file of this controller that holds tools and bases ($config.dat, a module)",
+        help="KUKA, ABB: further file of tools and bases ($config.dat, a module)",
     )
     parser.add_argument(
         "--frame",
@@ -298,8 +298,7 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         raise InputError(f"--posture-deg: {models.nominal.name} has {models.nominal.n} joints")
     given = dict(frame_given(dialect.maker, words) for words in args.frame)
     for path in args.frames:
-        frames = dialect.read(_program_text(path, dialect)).frames
-        given = {name: T for name, T in frames.items() if OF_LINE not in name} | given
+        given = _frames_of(path, dialect) | given
     correction = ProgramCorrection(
         dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
     )
@@ -327,6 +326,15 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         "verdict": verdict_document(verdict),
     }
     return CliResult(document, _show_corrected)
+
+
+def _frames_of(path: Path, dialect: Dialect) -> dict[str, Array]:
+    """Tools and bases by the names that a file of the controller has for them."""
+    read = dialect.read(_program_text(path, dialect)).frames
+    found = {name: T for name, T in read.items() if OF_LINE not in name}
+    if found.keys() <= dialect.read("").frames.keys():
+        raise InputError("holds no tool or base that is read here", file=str(path))
+    return found
 
 
 def _program_text(path: Path, dialect: Dialect) -> str:

@@ -28,6 +28,7 @@ from robocal_ros.programs.fanuc import FanucDialect
 from robocal_ros.programs.kawasaki import KawasakiDialect
 from robocal_ros.programs.krl import KrlDialect
 from robocal_ros.programs.points import (
+    OF_LINE,
     Dialect,
     Field,
     Program,
@@ -199,9 +200,12 @@ class ProgramCorrection:
         name = point.tool if kind == "tool" else point.frame
         name = name if name is not None else self._tool if kind == "tool" else self._frame
         if name is None:
-            raise LimitError(f"the program does not say its {kind}: give --{kind} NAME")
+            option = "tool" if kind == "tool" else "base"
+            raise LimitError(f"the program does not say its {kind}: give --{option} NAME")
         if name.lower() not in known:
-            raise LimitError(f"unknown {kind} {name}: give --frames FILE or --frame '{name}=…'")
+            in_file = self._dialect.names_frames and OF_LINE not in name
+            way = "--frames FILE or " if in_file else ""
+            raise LimitError(f"unknown {kind} {name}: give {way}--frame '{name}=…'")
         return known[name.lower()]
 
     def _solved(self, q: Array, wanted: Array) -> Array | str:

@@ -97,6 +97,7 @@ class KrlDialect(Dialect):
 
     maker, suffixes = "kuka", (".src", ".dat", ".sub")
     decimals = Decimals(length=4, turn=6, joint=6)
+    names_frames = True
 
     def read(self, text: str) -> Program:
         """Points of POS and E6POS, of AXIS and E6AXIS, and of motions; frames by number."""

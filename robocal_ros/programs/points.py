@@ -143,11 +143,12 @@ class Decimals:
 
 
 class Dialect(ABC):
-    """How one maker writes programs."""
+    """How one maker writes programs; ``names_frames``: whether its files give frames by name."""
 
     maker: Maker
     suffixes: tuple[str, ...]  # of its files
     decimals: Decimals
+    names_frames = False
 
     @abstractmethod
     def read(self, text: str) -> Program:

@@ -75,6 +75,7 @@ class RapidDialect(Dialect):
 
     maker, suffixes = "abb", (".mod", ".sys", ".prg", ".modx", ".sysx")
     decimals = Decimals(length=4, turn=8, joint=6)
+    names_frames = True
 
     def read(self, text: str) -> Program:
         """Robtargets and jointtargets, with the frames of the motions that name them."""

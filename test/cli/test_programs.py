@@ -92,7 +92,8 @@ def test_a_tool_that_is_reckoned_is_not_that_of_the_same_line_elsewhere(folder: 
     routine = "DEF part()\n$TOOL={}\n$BASE=$NULLFRAME\nPTP {}\nEND\n"
     (folder / "part.src").write_text(routine.format("reckon(1)", place))
     other = "{X 0.0,Y 0.0,Z 300.0,A 0.0,B 0.0,C 0.0}"
-    (folder / "other.src").write_text(routine.format(other, place))
+    data = f"TOOL_DATA[1]={other}\n"
+    (folder / "other.src").write_text(routine.format(other, place) + data)
     _, document = command(capsys, "part.src", *MODEL, "--frames", "other.src")
     (point,) = document["points"]
     assert point["state"] == "not_corrected"
@@ -142,6 +143,15 @@ def test_frames_and_bounds_come_from_the_command_line(folder: Path, capsys):
     status, document = command(capsys, "weld.dat", *MODEL, "--frame", "TOOL_DATA[3]=1,2,3")
     assert status == 2
     assert "NAME=X,Y,Z" in document["error"]["message"]
+
+
+def test_a_file_without_frames_is_refused_where_frames_are_wanted(folder: Path, capsys):
+    (folder / "none.dat").write_text("DEFDAT A\nENDDAT\n")
+    (folder / "sysframe.ls").write_text("UFRAME[1]: X 1.0 Y 2.0 Z 3.0\n")
+    for program, none in (("weld.dat", "none.dat"), ("sysframe.ls", "sysframe.ls")):
+        status, document = command(capsys, program, *MODEL, "--frames", none)
+        assert (status, document["error"]["file"]) == (2, none)
+        assert "no tool or base" in document["error"]["message"]
 
 
 def test_a_track_is_told_by_its_direction(folder: Path, capsys):

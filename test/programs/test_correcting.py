@@ -256,9 +256,17 @@ def test_a_frame_that_nobody_knows():
     ]
     bare = text.replace("DECL FDAT FP1", "DECL FDAT FX9")
     found, _ = reasons(bare)
-    assert "does not say its frame" in found[0]
+    assert found[0] == "the program does not say its frame: give --base NAME"
+    found, _ = reasons(bare, frame="base_data[5]")
+    assert found[0] == "the program does not say its tool: give --tool NAME"
     found, _ = reasons(bare, tool="tool_data[3]", frame="base_data[5]")
     assert found == ["", ""]
+    # what no file says by a name
+    reckoned = "$TOOL=TOOL_DATA[3]\n$BASE=near(1)\nLIN {X 1,Y 2,Z 3,A 0,B 0,C 0}\n"
+    found, _ = reasons(reckoned, ".src")
+    assert found == ["unknown frame $BASE of line 2: give --frame '$BASE of line 2=…'"]
+    found, _ = reasons(WRITTEN["fanuc"].text, ".ls")
+    assert found[0] == "unknown frame UF2: give --frame 'UF2=…'"
 
 
 def test_a_singular_posture_is_left_as_it_is():
