@@ -41,6 +41,9 @@ _CALL = re.compile(rf"\b({'|'.join(TARGETS)}|set_tcp)\s*(?=\()")
 _ASSIGNED = re.compile(r"\b(\w+)\s*=\s*(?=p?\[)")
 _LIST = re.compile(r"p?\s*(?=\[)")
 _COMPUTED = re.compile(r"\b(pose_trans|pose_add|pose_sub|interpolate_pose)\s*\(")
+_SET = re.compile(
+    r"^[ \t]*(?:(?:global|local)[ \t]+)?(\w+)[ \t]*(?:\[[^\]\r\n]*\])?[ \t]*=(?!=)[^\r\n]*", re.M
+)
 
 
 class UrScriptDialect(Dialect):
@@ -53,7 +56,8 @@ class UrScriptDialect(Dialect):
         """Lists that motions go to."""
         clean = masked(text, "#")
         frames: dict[str, Array] = {BASE: np.eye(4)}
-        lists = {found.end(): found[1] for found in _ASSIGNED.finditer(clean)}
+        assigned = list(_ASSIGNED.finditer(clean))
+        lists = {found.end(): found[1] for found in assigned}
         values: dict[str, list[int]] = {}
         for at, name in lists.items():
             values.setdefault(name, []).append(at)
@@ -75,6 +79,12 @@ class UrScriptDialect(Dialect):
             if not (
                 _LIST.match(target.word) or target.word in values or _COMPUTED.match(target.word)
             )
+        ]
+        literal, named = {found.start() for found in assigned}, {lists.get(at) for at in goals}
+        made += [
+            (found.start(1), found[0].strip())
+            for found in _SET.finditer(clean)
+            if found[1] in named and found.start(1) not in literal
         ]
         computed = tuple((line_of(text, at), words) for at, words in sorted(made))
         return Program(text, tuple(points), frames, computed)

@@ -398,6 +398,17 @@ def test_urscript_with_named_arguments_and_targets_that_are_not_read():
     assert found.computed == ((3, "l[0]"),)
 
 
+def test_points_that_a_script_changes_itself_are_told():
+    script = (
+        "A_p=p[.4,-.3,.2,0,3.1,0]\nA_p[2]=0.415+dz\nmovel(A_p)\n"
+        "  global A_p = get_actual_tcp_pose()\nif A_p==B:\nmovel(A_p)\nend\n"
+        "q=[0,1,2,3,4,5]\nx=q[1]\nmovej(q)\nA_p=p[.5,-.3,.2,0,3.1,0]\n"
+    )
+    found = dialect_of(".script").read(script)
+    assert [point.line for point in found.points] == [1, 8, 11]
+    assert found.computed == ((2, "A_p[2]=0.415+dz"), (4, "global A_p = get_actual_tcp_pose()"))
+
+
 def test_points_of_optimised_motions_of_urscript():
     script = "A_p=p[.4,-.3,.2,0,3.1,0]\noptimovel(A_p, a=.3, v=.3)\noptimovej([0,1,2,3,4,5])\n"
     found = dialect_of(".script").read(script)
