@@ -20,14 +20,14 @@ docs/programs.md.
 """
 
 import re
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import pose_of
+from robocal_ros.programs.flow import Flow, FlowStep, flow_steps
 from robocal_ros.programs.points import (
     NUMBER,
     OF_LINE,
@@ -60,6 +60,13 @@ _SET = re.compile(r"^[ \t]*(BASE|TOOL)[ \t]+([^\r\n]+)", re.M | re.I)
 _TRANS = re.compile(r"TRANS[ \t]*\(", re.I)
 _POINT = re.compile(rf"^[ \t]*POINT(?:/\w+)?[ \t]+({_NAME})[ \t]*=[ \t]*([^\r\n]*)", re.M | re.I)
 _HERE = re.compile(rf"\bHERE[ \t]+({_NAME})", re.I)
+_BLOCK = re.compile(
+    r"^(?:\.PROGRAM[ \t]+(?P<alone>[\w.]+)|[ \t]*(?:(?P<begin>IF\b(?=[^\r\n]*\bTHEN\b)|S?CASE)"
+    r"|(?P<loop>WHILE|FOR|DO)|(?P<branch>ELSEIF|S?VALUE|ANY)|(?P<else>ELSE)|(?P<end>END|UNTIL))"
+    r"\b(?![ \t]*[=\[]))",
+    re.M | re.I,
+)
+_CALL = re.compile(r"\bCALL[ \t]+([\w.]+)", re.I)
 _TOKEN = re.compile(_NAME)
 _POSTURE = re.compile(r"^[ \t]*(LEFTY|RIGHTY|ABOVE|BELOW|UWRIST|DWRIST)\b", re.M | re.I)
 
@@ -111,8 +118,12 @@ class KawasakiDialect(Dialect):
         uses = {name: _Use() for name in values}
         points: list[ProgramPoint] = []
         computed: list[tuple[int, str]] = []
+        steps = flow_steps(clean, _BLOCK, _CALL)
         for span in programs:
-            computed += _used(text, clean, span, constants, frames, uses, arrays)
+            steps += _set_up(text, clean, span, constants, frames)
+        flow = Flow(text, steps, frames)
+        for span in programs:
+            computed += _used(clean, span, flow, uses, arrays)
             points += _steps(text, clean, *span)
         for found in located:
             use = uses[found[1].lower()]
@@ -129,21 +140,15 @@ class KawasakiDialect(Dialect):
 
 
 def _used(
-    text: str,
     clean: str,
     span: tuple[int, int],
-    constants: Mapping[str, "re.Match[str]"],
-    frames: dict[str, Array],
+    flow: Flow,
     uses: Mapping[str, _Use],
     arrays: Mapping[str, Sequence[str]],
 ) -> list[tuple[int, str]]:
-    """Note what one program does with each location; the places where it makes points itself.
-
-    ``constants``: locations that no program sets, by name.
-    """
+    """Note what one program does with each location; the places where it makes points itself."""
     computed = []
     goals: set[int] = set()
-    settings, set_up = deque(_SET.finditer(clean, *span)), dict[str, str]()
     for found in _MOTION.finditer(clean, *span):
         target = arguments(clean, found.start(1), found.end(1))[0]
         name = re.split(r"\s+TILL\b", target.text, flags=re.I)[0].strip()
@@ -152,8 +157,7 @@ def _used(
         if not _TOKEN.fullmatch(name):
             computed.append((target.start, name))
         elif name.lower() in uses:
-            while settings and settings[0].start() < target.start:
-                _set_up(text, clean, settings.popleft(), constants, frames, set_up)
+            set_up = flow.at(target.start)
             goals.add(target.start)
             use = uses[name.lower()]
             use.goals.append(target.start)
@@ -191,19 +195,19 @@ def _note_array(
 def _set_up(
     text: str,
     clean: str,
-    setting: "re.Match[str]",
+    span: tuple[int, int],
     constants: Mapping[str, "re.Match[str]"],
     frames: dict[str, Array],
-    set_up: dict[str, str],
-) -> None:
-    """The program sets tool or base, whose name is in force from here on."""
-    kind, word = setting[1].upper(), setting[2].strip()
-    name = f"{kind}{OF_LINE}{line_of(text, setting.start())}"
-    if word.upper() == NULL:
-        name = NULL
-    elif (T := _constant(clean, setting.start(2), setting.end(2), constants)) is not None:
-        frames[name] = T
-    set_up[kind] = name
+) -> Iterator[FlowStep]:
+    """Where a program sets tool or base; ``constants``: locations that no program sets, by name."""
+    for setting in _SET.finditer(clean, *span):
+        kind, word = setting[1].upper(), setting[2].strip()
+        name = f"{kind}{OF_LINE}{line_of(text, setting.start())}"
+        if word.upper() == NULL:
+            name = NULL
+        elif (T := _constant(clean, setting.start(2), setting.end(2), constants)) is not None:
+            frames[name] = T
+        yield FlowStep(setting.start(), "set", {kind: name})
 
 
 def _constant(

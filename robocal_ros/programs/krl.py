@@ -10,7 +10,6 @@ Sources are in docs/programs.md.
 """
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -18,6 +17,7 @@ import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import DEGREE, pose_of
+from robocal_ros.programs.flow import Flow, FlowStep, flow_steps
 from robocal_ros.programs.points import (
     EDGE,
     OF_LINE,
@@ -68,10 +68,16 @@ _SET = re.compile(
     r"(?P<value>(?:\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?)[^\r\n;]*)"
     r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)"
     r"|^[ \t]*FDAT_ACT(?:\.\w+)?\s*=(?!=)\s*(?P<fdat>\{[^{}]*\}|[^\r\n]*)"
-    r"|\$IPO_MODE\s*=(?!=)\s*(?P<mode>#?\w+)"
-    r"|^[ \t]*(?:GLOBAL\s+)?(?P<routine>DEF(?:FCT)?)\b",
+    r"|\$IPO_MODE\s*=(?!=)\s*(?P<mode>#?\w+)",
     re.I | re.M,
 )
+_BLOCK = re.compile(
+    r"^[ \t]*(?:(?P<begin>IF|SWITCH)|(?P<loop>WHILE|FOR|LOOP|REPEAT)|(?P<branch>CASE|DEFAULT)"
+    r"|(?P<else>ELSE)|(?P<end>UNTIL|END(?:IF|SWITCH|WHILE|FOR|LOOP|FCT)?)"
+    r"|(?:GLOBAL[ \t]+)?DEF(?:FCT[ \t]+[\w\[\]]+)?[ \t]+(?P<alone>\w+))\b",
+    re.I | re.M,
+)
+_CALL = re.compile(r"\b(\w+)[ \t]*\(")
 _WITH = re.compile(
     rf"^(?P<motion>[ \t]*(?:(?P<block>(?:PTP_)?SPLINE)|{MOVES})\b[^\r\n=]*?\bWITH\b)[^\r\n]*",
     re.I | re.M,
@@ -109,7 +115,7 @@ class KrlDialect(Dialect):
             if T is not None:
                 frames[f"{found[1].upper()}[{found[2]}]"] = T
         inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
-        set_above = list(_settings(text, clean, frames, inline))
+        flow, within = _flow(text, clean, frames, inline), _withs(text, clean, frames, inline)
         used = {name.upper() for found in _USED.finditer(clean) for name in found.groups() if name}
         used |= {name.partition("[")[0] for name in used if not _NUMBERED.search(name)}
         for found in _DECLARED.finditer(clean):  # an array's points are assigned one by one
@@ -123,7 +129,7 @@ class KrlDialect(Dialect):
             point = _point(text, clean, braces, used)
             if point is None:
                 continue
-            point = _framed(point, braces.start(), inline, set_above)
+            point = _framed(point, braces.start(), inline, flow, within)
             name = point.name.upper()
             if line := reckoned.get(name, reckoned.get(name.partition("[")[0])):
                 problem = f"the program reckons with it in line {line}"
@@ -242,12 +248,12 @@ def _posture(parts: dict[str, Field]) -> Posture:
 
 
 @dataclass(frozen=True)
-class _Set:
-    """Tool, base and IPO mode as of `_given`, from a place on; ``until``: of a WITH its end."""
+class _With:
+    """What a WITH sets, as of `_given`, for its motion or block."""
 
     at: int
     names: dict[str, str | None]
-    until: float = np.inf
+    until: int
 
 
 def _without(clean: str) -> str:
@@ -255,12 +261,19 @@ def _without(clean: str) -> str:
     return _WITH.sub(lambda found: found["motion"].ljust(len(found[0])), clean)
 
 
-def _settings(
-    text: str, clean: str, frames: dict[str, Array], inline: dict[str, str]
-) -> Iterator[_Set]:
-    """What is set, in the order of the text, then what a WITH sets, which goes before it."""
-    for found in _SET.finditer(_without(clean)):
-        yield _Set(found.start(), _given(line_of(text, found.start()), found, frames, inline))
+def _flow(text: str, clean: str, frames: dict[str, Array], inline: dict[str, str]) -> Flow:
+    """What is set but by a WITH."""
+    clean = _without(clean)
+    steps = flow_steps(clean, _BLOCK, _CALL)
+    for found in _SET.finditer(clean):
+        names = _given(line_of(text, found.start()), found, frames, inline)
+        steps.append(FlowStep(found.start(), "set", names))
+    return Flow(text, steps, frames)
+
+
+def _withs(text: str, clean: str, frames: dict[str, Array], inline: dict[str, str]) -> list[_With]:
+    """In the order of the text: an inner one goes before the one around it."""
+    sets = []
     for found in _WITH.finditer(clean):
         end = _END_OF_BLOCK.search(clean, found.end()) if found["block"] else None
         until = end.start() if end else found.end()
@@ -268,27 +281,32 @@ def _settings(
             if given := _SET.match(part.text):
                 names = _given(line_of(text, part.start), given, frames, inline)
                 if None not in names.values():
-                    yield _Set(found.start(), names, until)
+                    sets.append(_With(found.start(), names, until))
+    return sets
 
 
 def _given(
     line: int, found: re.Match[str], frames: dict[str, Array], inline: dict[str, str]
 ) -> dict[str, str | None]:
-    """Tool or base that a place in the text sets, None: not known from it on; IPO: #TCP or not."""
-    if found["routine"] or (found["bas"] or "").upper() == "INITMOV":
-        return {"TOOL": None, "BASE": None, "IPO": None}
+    """Tool or base that a place in the text sets, None: not known from it on.
+
+    ``$IPO_MODE`` is #TCP, or empty where the tool is carried.
+    """
+    if (found["bas"] or "").upper() == "INITMOV":
+        return dict.fromkeys(("$TOOL", "$BASE", "$IPO_MODE"))
     here = f"{OF_LINE}{line}"  # of what is not read here: unknown
     if found["mode"]:
-        return {"IPO": found["mode"].upper()}
+        return {"$IPO_MODE": _carried(found["mode"])}
     if found["fdat"] is not None:  # for the BAS(#FRAMES) behind it
         word = found["fdat"].strip()
         body = word[1:-1] if word.startswith("{") else inline.get(word.upper(), "")
         return _of_fdat(body, here)
     if found["bas"]:
         kind, number = found["bas"].upper(), found["number"].strip()
-        return {kind: f"{kind}_DATA[{number}]" if number.isdigit() else f"${kind}{here}"}
-    kind, value = found["kind"].upper(), found["value"].strip()
-    name = f"${kind}{here}"
+        known = f"{kind}_DATA[{number}]" if number.isdigit() else f"${kind}{here}"
+        return {f"${kind}": known}
+    kind, value = f"${found['kind'].upper()}", found["value"].strip()
+    name = f"{kind}{here}"
     T = _frame(value[1:-1]) if re.fullmatch(r"\{[^{}]*\}", value) else None
     if T is not None:
         frames[name] = T
@@ -297,29 +315,34 @@ def _given(
     return {kind: name}
 
 
+def _carried(mode: str) -> str:
+    """An IPO mode where the robot carries the part; else empty."""
+    return mode.strip().upper() if mode.strip().upper() == "#TCP" else ""
+
+
 def _of_fdat(body: str, here: str) -> dict[str, str | None]:
     """What the components of an FDAT set; ``here``: behind the name of what they leave out."""
     parts = {name: part.text.strip().upper() for name, part in _parts(body, 0).items()}
-    names: dict[str, str | None] = {"IPO": parts.get("IPO_FRAME")}
+    names: dict[str, str | None] = {"$IPO_MODE": _carried(parts.get("IPO_FRAME", ""))}
     for kind in ("TOOL", "BASE"):
         number = parts.get(f"{kind}_NO")
-        names[kind] = f"${kind}{here}" if number is None else f"{kind}_DATA[{number}]"
+        names[f"${kind}"] = f"${kind}{here}" if number is None else f"{kind}_DATA[{number}]"
     return names
 
 
 def _framed(
-    point: ProgramPoint, at: int, inline: dict[str, str], set_above: list[_Set]
+    point: ProgramPoint, at: int, inline: dict[str, str], flow: Flow, within: list[_With]
 ) -> ProgramPoint:
     """The point with the names of its frames, and what about them forbids a correction."""
-    names: dict[str, str | None] = {}
+    names = dict(flow.at(at))
     body = inline.get("F" + point.name.upper().removeprefix("X"))
     if body is not None:
         names = _of_fdat(body, f"{OF_LINE}{point.line}")
     else:
-        for one in set_above:
+        for one in within:
             if one.at <= at < one.until:
                 names |= one.names
-    if names.get("IPO") == "#TCP":
+    if names.get("$IPO_MODE"):
         words = "the robot carries the part to a tool that stands"
         return replace(point, problem=point.problem or words)
-    return replace(point, tool=names.get("TOOL"), frame=names.get("BASE"))
+    return replace(point, tool=names.get("$TOOL"), frame=names.get("$BASE"))

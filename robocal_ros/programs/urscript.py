@@ -16,6 +16,7 @@ import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import pose_of
+from robocal_ros.programs.flow import Flow, FlowStep, flow_steps
 from robocal_ros.programs.points import (
     OF_LINE,
     Decimals,
@@ -36,8 +37,14 @@ TARGETS = {
     "optimovej": 1, "optimovel": 1,
 }  # fmt: skip
 BASE, TCP = "base", "tcp"
+SET_TCP = "set_tcp"
 
-_CALL = re.compile(rf"\b({'|'.join(TARGETS)}|set_tcp)\s*(?=\()")
+_CALL = re.compile(rf"\b({'|'.join(TARGETS)}|{SET_TCP})\s*(?=\()")
+_BLOCK = re.compile(
+    r"\b(?:(?P<begin>if)|(?P<loop>while|for)|(?P<branch>elif)|(?P<else>else)|(?P<end>end)"
+    r"|(?:def|thread|sec)\s+(?P<routine>\w+))\b"
+)
+_OWN_CALL = re.compile(r"\b(\w+)\s*\(")
 _ASSIGNED = re.compile(r"\b(\w+)\s*=\s*(?=p?\[)")
 _LIST = re.compile(r"p?\s*(?=\[)")
 _COMPUTED = re.compile(r"\b(pose_trans|pose_add|pose_sub|interpolate_pose)\s*\(")
@@ -103,17 +110,23 @@ class _Target:
 
 def _targets(text: str, clean: str, frames: dict[str, Array]) -> list[_Target]:
     """What the motions go to, in the order of the text; poses of set_tcp go into ``frames``."""
-    found, tool = [], None
-    for call in _CALL.finditer(clean):
-        parts = arguments(clean, call.end() + 1, matching(clean, call.end()))
-        if call[1] == "set_tcp":
+    calls = [
+        (call, arguments(clean, call.end() + 1, matching(clean, call.end())))
+        for call in _CALL.finditer(clean)
+    ]
+    steps = flow_steps(clean, _BLOCK, _OWN_CALL)
+    for call, parts in calls:
+        if call[1] == SET_TCP:
             fields = _fields(clean, parts[0].start)
-            tool = f"set_tcp{OF_LINE}{line_of(text, call.start())}"
+            tool = f"{SET_TCP}{OF_LINE}{line_of(text, call.start())}"
             if fields is not None and len(fields) == 6 and not require_numbers(fields):
                 frames[tool] = pose_of("ur", [part.value for part in fields])
-            continue
-        for part in parts[: TARGETS[call[1]]]:
-            word, near, own = _unnamed(part), None, tool
+            steps.append(FlowStep(call.start(), "set", {SET_TCP: tool}))
+    flow, found = Flow(text, steps, frames), []
+    for call, parts in calls:
+        tool_there = flow.at(call.start()).get(SET_TCP)
+        for part in parts[: TARGETS.get(call[1], 0)]:
+            word, near, own = _unnamed(part), None, tool_there
             inverse = re.match(r"get_inverse_kin\s*(?=\()", word.text)
             if inverse:
                 at = word.start + inverse.end()

@@ -215,65 +215,6 @@ def test_a_base_that_is_a_product_is_unknown():
         assert "$BASE of line 1" not in found.frames
 
 
-def test_what_with_sets_holds_for_its_motion_or_block_alone():
-    """As inline forms of KSS 8 write it; SVEL_CP( ) and its like make no point."""
-    krl = (
-        "$TOOL=TOOL_DATA[1]\n$BASE=BASE_DATA[1]\n"
-        "SPTP XHOME WITH $VEL_AXIS[1] = SVEL_JOINT(100.0), $TOOL = STOOL2(F), $BASE = SBASE(F)\n"
-        f"SLIN {POINT} WITH $VEL=SVEL_CP(2.0, , L), $BASE=BASE_DATA[2]\nLIN {POINT}\n"
-        "SPLINE WITH $TOOL={X 1,Y 0,Z 0,A 0,B 0,C 0}, $BASE=BASE_DATA[3]\n"
-        f"SPL {POINT}\nSLIN {POINT} WITH $VEL.CP=1\nENDSPLINE\nLIN {POINT}\n"
-    )
-    found = dialect_of(".src").read(krl)
-    tools = [point.tool for point in found.points]
-    block = "$TOOL of line 6"
-    assert tools == ["TOOL_DATA[1]", "TOOL_DATA[1]", block, block, "TOOL_DATA[1]"]
-    assert found.frames[block][0, 3] == pytest.approx(1e-3)
-    bases = [point.frame for point in found.points]
-    assert bases == [f"BASE_DATA[{n}]" for n in (2, 1, 3, 3, 1)]
-    assert found.computed == ()
-
-
-def test_frames_that_are_set_by_fdat_act():
-    """As off-line programs set them, and inline forms where these are unfolded."""
-    krl = (
-        "DECL FDAT FP1={TOOL_NO 3,BASE_NO 4,IPO_FRAME #BASE}\nDECL FDAT FP2={TOOL_NO 5,BASE_NO 5,"
-        "IPO_FRAME #TCP}\nDECL FDAT FDAT_ACT={TOOL_NO 9,BASE_NO 9,IPO_FRAME #NONE}\n"
-        f"LIN {POINT}\nBAS(#TOOL,1)\nBAS(#BASE,1)\n"
-        "FDAT_ACT = {TOOL_NO 6,BASE_NO 2,IPO_FRAME #BASE}\nBAS (#FRAMES)\n"
-        f"LIN {POINT}\nFDAT_ACT=FP1\nBAS(#PTP_PARAMS,100)\nLIN {POINT}\n"
-        f"FDAT_ACT=FP7\nBAS(#FRAMES)\nLIN {POINT}\nFDAT_ACT=FP2\nLIN {POINT}\n"
-        f"BAS(#TOOL,1)\nBAS(#BASE,1)\nLIN {POINT}\nFDAT_ACT=FP1\nLIN {POINT}\n"
-    )
-    points = dialect_of(".src").read(krl).points
-    frames = [(point.tool, point.frame) for point in points]
-    assert frames[:3] == [
-        (None, None), ("TOOL_DATA[6]", "BASE_DATA[2]"), ("TOOL_DATA[3]", "BASE_DATA[4]"),
-    ]  # fmt: skip
-    assert frames[3] == ("$TOOL of line 13", "$BASE of line 13")  # of another file
-    assert ["stands" in point.problem for point in points[4:]] == [True, True, False]
-
-
-def test_a_robot_that_carries_the_part_as_its_ipo_mode_says():
-    krl = (
-        f"DEF A()\n$IPO_MODE=#TCP\n$TOOL=TOOL_DATA[1]\n$BASE=BASE_DATA[1]\nLIN {POINT}\n"
-        f"SLIN {POINT} WITH $IPO_MODE=#BASE\n$IPO_MODE=#BASE\nLIN {POINT}\n"
-        f"SLIN {POINT} WITH $IPO_MODE=#TCP\nLIN {POINT}\n$IPO_MODE=#TCP\nEND\n"
-        f"DEF B()\nLIN {POINT}\nEND\n"
-    )
-    points = dialect_of(".src").read(krl).points
-    stands = ["stands" in point.problem for point in points]
-    assert stands == [True, False, False, True, False, False]
-
-
-def test_a_routine_does_not_have_the_frames_of_the_one_above():
-    """It has those of its caller, which the order of the text does not tell."""
-    krl = "DEF A()\n$BASE=BASE_DATA[1]\nB()\n$BASE=BASE_DATA[2]\nEND\n"
-    krl += f"GLOBAL DEF B()\nLIN {POINT}\nEND\n"
-    (point,) = dialect_of(".src").read(krl).points
-    assert point.frame is None
-
-
 def test_points_in_an_array_are_found_whatever_counts_them():
     text = f"P[1]={POINT}\nQ[1]={POINT}\nR[1]={POINT}\nFOR I=1 TO 2\nPTP P[I]\nLIN Q[1]\nENDFOR\n"
     assert [point.name for point in dialect_of(".src").read(text).points] == ["P[1]", "Q[1]"]
