@@ -179,7 +179,7 @@ class ToolRecord:
     """What is known of the tool in force from its last measurement."""
 
     # "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong and has
-    # no result for the tool in force; empty: never measured
+    # no result for the tool in force, or what it found is lost; empty: never measured
     answer: str = ""
     words: str = "the tool was never checked"
     deviation_mm: float = 0.0
@@ -270,6 +270,8 @@ class Memory:
                 run=memory.runs,
             )
             memory.end(result, Code.CONFLICT, words)
+            lost = "what the cycle in which the node ended found of it is lost: check it"
+            memory.note_tool(answer="failed", words=lost)
             memory.save()
         memory.earlier = frozenset(memory.cycles)
         return memory

@@ -5,7 +5,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from driven_robot import AheadMotion
 from maintenance_cell import (
+    HOME,
     LONG_S,
     POSES,
     SILENT,
@@ -18,6 +20,7 @@ from maintenance_cell import (
     wrong_tool,
 )
 from maintenance_tools import (
+    a_check_passes,
     automatic,
     decide,
     level,
@@ -95,6 +98,36 @@ def until_answered(cell: Cell) -> int:
     answered(cell)
     assert cell.history.head(TOOL).calibration_id == number
     return number
+
+
+def killed(cell: Cell) -> None:
+    """The node; a person brings the robot home and acknowledges."""
+    cell.restart()
+    cell.motion = AheadMotion(HOME)
+    cell.open_gap()
+    cell.pass_time(0.5)
+    assert cell.state is MaintenanceState.FAULT
+    cell.session.acknowledge("me")
+
+
+def test_a_tool_is_not_known_where_the_node_is_killed_on_the_way_home_from_its_check(history):
+    cell = opened(history)
+    assert cell.ran("c0").tool_answer == "pass"
+    cell.check = bent()
+    until_measuring(cell, "quick")
+    answered(cell)
+    killed(cell)
+    assert level(cell) is AccuracyLevel.DEGRADED
+    assert "found of it is lost" in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
+    a_check_passes(cell, "c2")
+
+
+def test_an_accepted_tool_that_failed_its_check_as_the_node_was_killed_is_not_known(history):
+    cell = automatic(history)
+    until_answered(cell)
+    killed(cell)
+    assert level(cell) is AccuracyLevel.DEGRADED
+    a_check_passes(cell, "c2")
 
 
 def test_a_tool_that_failed_its_check_is_taken_back_by_a_cancelled_run_too(history):
@@ -203,13 +236,17 @@ def postponed(cell: Cell) -> int:
     return number
 
 
-@pytest.mark.parametrize("restarted", [False, True])
-def test_a_tool_whose_check_does_not_fit_is_accepted_in_the_next_gap(history, restarted):
+@pytest.mark.parametrize("meanwhile", ["nothing", "a restart", "a kill"])
+def test_a_tool_whose_check_does_not_fit_is_accepted_in_the_next_gap(history, meanwhile):
     cell = automatic(history, poses=NO_POSES)
     number = postponed(cell)
-    if restarted:
+    if meanwhile == "a restart":
         cell.restart()
         cell.open_gap()
+    elif meanwhile == "a kill":
+        cell.open_gap()
+        assert cell.run("killed", CHECK_ONLY_S) is Code.ACCEPT
+        killed(cell)
     cell.check = passed()
     short = run(cell, "c3", 15.0)
     assert (short.accepted, short.left) == ((), (f"acceptance of tool candidate {number}",))
