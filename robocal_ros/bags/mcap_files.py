@@ -30,7 +30,7 @@ from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
-from zstandard import ZstdError
+from zstandard import ZstdDecompressor, ZstdError
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import share_folders
@@ -263,10 +263,11 @@ class Messages(NamedTuple):
 
 
 MAGIC = b"\x89MCAP0\r\n"
+ZSTD = b"\x28\xb5\x2f\xfd"
 OTHER_FORMATS = {
     b"SQLite format 3\0": "an SQLite bag; convert it with 'ros2 bag convert' (storage_id: mcap)",
     b"#ROSBAG V2.0": "a bag of ROS 1; convert it with 'rosbags-convert --dst-storage mcap'",
-    b"\x28\xb5\x2f\xfd": "compressed as a whole; unpack it with 'zstd -d'",
+    ZSTD: "compressed as a whole; unpack it with 'zstd -d'",
 }
 HEAD = struct.Struct("<BQ")  # opcode, length
 TIMES = struct.Struct("<QQ")
@@ -364,10 +365,10 @@ def read_block(
         stream.seek(block.offset)
         data = stream.read(block.size)
         found = _stored(_unpacked(data) if block.chunked else memoryview(data))
+        found = _decompressed(found.take(np.isin(found.channel, list(wanted))))
     except (*DAMAGE, OSError) as error:
         _lose(file, block, data, error)
         return None
-    found = found.take(np.isin(found.channel, list(wanted)))
     return found.take(np.argsort(found.log_time_ns, kind="stable"))
 
 
@@ -499,6 +500,23 @@ def _stored(content: memoryview) -> Messages:
     from robocal_ros.ground.serialized import find_messages
 
     return Messages(content, *find_messages(content))
+
+
+def _decompressed(found: Messages) -> Messages:
+    """Messages as they were before ``ros2 bag record --compression-mode message``.
+
+    The file does not tell of it; CDR never begins as zstd does.
+    """
+    if not len(found.begin):
+        return found
+    content = np.frombuffer(found.content, dtype=np.uint8)
+    if not (content[np.minimum(found.begin, len(content) - 1)] == ZSTD[0]).any():
+        return found
+    unzip = ZstdDecompressor().decompress
+    stored = [bytes(found.data(place)) for place in range(len(found.begin))]
+    data = [unzip(one) if one.startswith(ZSTD) else one for one in stored]
+    edges = np.cumsum([0, *map(len, data)], dtype=np.int64)
+    return found._replace(content=memoryview(b"".join(data)), begin=edges[:-1], end=edges[1:])
 
 
 def _unpacked(record: bytes) -> memoryview:

@@ -16,6 +16,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
+from rosbags import rosbag2
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagReader, BagWriter, bag_info, read_bag
@@ -139,6 +140,28 @@ def test_bags_of_other_recorders(small_bag: Path, tmp_path: Path, options: dict[
     assert list(read_bag(other, raw=True)) == list(read_bag(small_bag, raw=True))
     assert bag_info(other).topics == bag_info(small_bag).topics
     assert not bag_info(other).truncated
+
+
+def test_messages_that_a_recorder_compressed_one_by_one_are_read(
+    small_bag: Path, tmp_path: Path
+) -> None:
+    """As of ``ros2 bag record -s mcap --compression-mode message --compression-format zstd``."""
+    plain = list(read_bag(small_bag, raw=True))
+    folder = tmp_path / "bag"
+    writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    writer.set_compression(rosbag2.CompressionMode.MESSAGE, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        topics = {
+            topic: writer.add_connection(topic, msgtype, typestore=ros_types())
+            for topic, msgtype in {(m.topic, m.msgtype) for m in plain}
+        }
+        for message in plain:
+            writer.write(topics[message.topic], message.log_time_ns, message.message)
+    assert list(read_bag(folder, raw=True)) == plain
+    assert len(list(read_bag(folder, ["/measured_pose"]))) == 20
+    with BagReader(folder) as bag:
+        found = bag.messages(["/joint_states"], blocks=["/joint_states"])
+        assert sum(len(block.message) for block in found) == 200
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])
