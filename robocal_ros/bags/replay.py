@@ -231,7 +231,7 @@ def heard_messages(
             yield recorded
             continue
         block = isinstance(message, JointBlock)
-        stamps = message.stamp_ns if block else np.array([_stamp_ns(message)])
+        stamps = message.stamp_ns if block else np.array([stamp_of(message)])
         after, before = ends[kind]
         place = np.searchsorted(after, stamps) - 1  # of the last one that begins before the stamp
         gone = (place >= 0) & (stamps < before[place])
@@ -244,8 +244,8 @@ def heard_messages(
             yield One(recorded.topic, kept)
 
 
-def _stamp_ns(message: Any) -> int:
-    """Of a message or a sample."""
+def stamp_of(message: Any) -> int:
+    """Stamp of a message, or of a sample that was made of some, ns."""
     return int(message.stamp_ns if hasattr(message, "stamp_ns") else stamp_ns(message.header.stamp))
 
 

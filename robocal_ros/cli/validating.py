@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.bags.bags import BagMessage, BagReader, open_bag
-from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
+from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, stamp_of, topic_kind
 from robocal_ros.cell_sim.faults import SIZES
 from robocal_ros.cli.main import Document, refusal
 from robocal_ros.cli.recording import (
@@ -40,7 +40,7 @@ from robocal_ros.cli.replay import ReplayRequest, replay_bag, seconds
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.frames import Array
-from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
+from robocal_ros.ground.samples import MEASURING, Measurements
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Action, Entry
 from robocal_ros.identification.judged import held_out_errors
@@ -379,7 +379,7 @@ class Forecasts:
         for sample in samples:
             kind = recording.inputs.get(sample.topic)
             if kind in MEASURING and session.reference is not None:
-                now_ns = stamp_ns(sample.message.header.stamp)
+                now_ns = stamp_of(sample.message)
                 if (error := session.accuracy(now_ns).error) is not None:
                     self._known.append((now_ns, error.rms_m * 1e3, error.bound_m * 1e3))
             yield sample

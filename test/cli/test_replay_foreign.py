@@ -114,6 +114,15 @@ def test_sqlite_gives_what_ros1_gives(shift, sqlite, capsys):
     assert document["candidates"] == json.loads(json.dumps(shift["candidates"]))
 
 
+def test_a_stream_of_others_is_validated_with_a_forecast_of_each_cycle(ros1, tmp_path, capsys):
+    words = ("--robot", "kr150_r3100", "--topic", POSE, "--report", str(tmp_path / "report"))
+    assert main(["validate", str(ros1), *words]) == 0, capsys.readouterr().out
+    (bag,) = json.loads((tmp_path / "report" / "report.json").read_text())["bags"]
+    (session,) = bag["sessions"]
+    assert len(session["cycles"]) == len(visits()) - 1
+    assert all(cycle["forecast"] is not None for cycle in session["cycles"])
+
+
 def test_what_is_missing_is_said_with_the_topic_that_could_be_it(ros1, capsys):
     status, document = replayed(capsys, ros1, "--robot", "kr150_r3100", "--auto")
     assert status == 2
