@@ -98,7 +98,10 @@ class BagReader:
     def __init__(self, path: str | Path) -> None:
         self._path = Path(path)
         paths, notes = _bag_files(self._path)
-        self._files = [open_file(file) for file in paths]
+        begun = [file for file in paths if not _is_empty(file)]
+        if begun:  # a crash just after a split leaves a file in which nothing is yet
+            notes += [f"{p}: empty, the recording broke off there" for p in paths if p not in begun]
+        self._files = [open_file(file) for file in begun or paths]
         for file in self._files:
             for number, channel in file.channels.items():
                 file.channels[number] = replace(channel, topic=graph_name(channel.topic))
@@ -140,7 +143,7 @@ class BagReader:
             topics={topic: TopicInfo(types[topic], counts[topic]) for topic in sorted(counts)},
             start_ns=min(starts, default=None),
             end_ns=max(ends, default=None),
-            truncated=any(file.notes for file in self._files),
+            truncated=bool(self._notes),
             notes=(*self._notes, *losses),
             lost=tuple(lost for file in self._files for lost in file.lost.values()),
         )
@@ -286,6 +289,14 @@ def _bag_files(path: Path) -> tuple[list[Path], list[str]]:
     if not names:
         raise InputError("this bag has no files", file=str(metadata))
     return [path / name for name in names], []
+
+
+def _is_empty(file: Path) -> bool:
+    """Whether it is there without a byte."""
+    try:
+        return not file.stat().st_size
+    except OSError:  # told where it is opened
+        return False
 
 
 def _utc(stamp_ns: int | None) -> str:

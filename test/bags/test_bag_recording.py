@@ -72,6 +72,20 @@ def test_what_was_flushed_is_there_after_a_crash(tmp_path):
     assert len(found) >= 130
 
 
+def test_a_crash_just_after_a_split_leaves_the_files_before_readable(tmp_path):
+    """The new file is named at once, and its first bytes come with the next flush."""
+    recording, written = BagRecording(tmp_path / "r", latched=(), file_bytes=FILE_BYTES), 0
+    while len(files := sorted((tmp_path / "r").glob("*.mcap"))) < 2:
+        fill(recording, 1, start=written)
+        written += 1
+    assert files[1].stat().st_size == 0
+    assert numbers(tmp_path / "r") == list(range(written - 1))
+    with BagReader(tmp_path / "r") as bag:
+        (note,) = bag.info.notes
+        assert bag.info.truncated
+    assert note == f"{files[1]}: empty, the recording broke off there"
+
+
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="file/r: cannot be made"):
