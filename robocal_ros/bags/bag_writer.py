@@ -28,7 +28,7 @@ from mcap.writer import CompressionType, Writer
 from robocal_ros import __version__
 from robocal_ros.bags.mcap_files import definition, encode, full_name
 from robocal_ros.ground.errors import InputError, StorageError
-from robocal_ros.ground.files import lies_at, read_text, write_text
+from robocal_ros.ground.files import lies_at, read_text, sync_folder, write_text
 
 CHUNK_BYTES = 256 * 1024  # what a writer that is killed can lose
 _COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}
@@ -331,6 +331,7 @@ class BagRecording:
     def _finish(self) -> None:
         writer, self._writer = self._writer, None
         if writer is not None:
+            writer.flush()
             writer.close()
             self._describe()
 
@@ -375,7 +376,8 @@ class BagRecording:
             }
         }  # fmt: skip
         try:
-            write_text(self.folder / "metadata.yaml", yaml.safe_dump(metadata))
+            text = yaml.safe_dump(metadata)
+            write_text(self.folder / "metadata.yaml", text, durable=True)
         except InputError as error:
             raise self._broken(error) from error
 
@@ -461,10 +463,12 @@ def new_folder(parent: Path, maker: Maker, wall_ns: int | None = None) -> Path:
                 folder = parent / f"{PREFIX}{stamp}_{again}"
         mark = asdict(maker) | {"folder": folder.name, "number": number, "begun_ns": wall_ns}
         try:
-            write_text(folder / MARKER, json.dumps(mark | {"software": __version__}) + "\n")
+            text = json.dumps(mark | {"software": __version__})
+            write_text(folder / MARKER, f"{text}\n", durable=True)
         except InputError:
             folder.rmdir()
             raise
+        sync_folder(parent)
     except (OSError, InputError) as error:
         words = error.strerror or error if isinstance(error, OSError) else error
         raise StorageError(f"{folder}: cannot be made: {words}") from error
@@ -542,7 +546,7 @@ def keep(folder: Path, why: str) -> None:
     """
     if not folder.is_dir():
         raise InputError("no such recording", file=str(folder))
-    write_text(folder / KEEP, f"{why}\n")
+    write_text(folder / KEEP, f"{why}\n", durable=True)
 
 
 def _look(parent: Path) -> tuple[list[MarkedRecording], dict[str, str]]:
@@ -588,7 +592,7 @@ def _delete(folder: Path) -> list[str]:
 
     Returns what else lies there, which stays.
     """
-    draft = rf"\.(metadata\.yaml|{KEEP}|{re.escape(MARKER)})\.\d+"
+    draft = rf"\.(metadata\.yaml|{KEEP}|{re.escape(MARKER)})(\.\d+)+"
     files = rf"{re.escape(folder.name)}_\d+\.mcap|{OPEN}|metadata\.yaml|{draft}"
     strangers = []
     for path in sorted(folder.iterdir()):

@@ -265,11 +265,12 @@ def _bag_files(path: Path) -> tuple[list[Path], list[str]]:
     if not path.is_dir():
         return [path], []
     metadata = path / "metadata.yaml"
-    if not metadata.is_file():
+    if not metadata.is_file() or _is_empty(metadata):
         files = sorted(path.glob("*.mcap"))
         if not files:
             raise InputError("no metadata.yaml and no .mcap file in this folder", file=str(path))
-        return files, [f"{path}: no metadata.yaml (the recording broke off); all .mcap files read"]
+        lacks = "no metadata.yaml, or an empty one (the recording broke off)"
+        return files, [f"{path}: {lacks}; all .mcap files read"]
     try:
         content = yaml.safe_load(read_text(metadata, "bag's metadata"))
         described = content["rosbag2_bagfile_information"]

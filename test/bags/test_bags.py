@@ -379,9 +379,14 @@ def test_a_folder_of_several_files(tmp_path: Path) -> None:
     assert (info.start_ns, info.end_ns) == (0, 21 * MS)
 
 
-def test_a_folder_whose_recording_broke_off(tmp_path: Path) -> None:
+@pytest.mark.parametrize("empty", [False, True])
+def test_a_folder_whose_recording_broke_off(tmp_path: Path, *, empty: bool) -> None:
     write_folder(tmp_path / "bag")
-    (tmp_path / "bag" / "metadata.yaml").unlink()
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    if empty:  # as a power cut may leave it
+        metadata.write_bytes(b"")
+    else:
+        metadata.unlink()
     with pytest.warns(UserWarning, match=r"no metadata\.yaml"):
         assert len(list(read_bag(tmp_path / "bag"))) == 24
 

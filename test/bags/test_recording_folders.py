@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from robocal_ros.bags.bag_writer import (
+    KEEP,
     MARKER,
     BagRecording,
     Maker,
@@ -26,6 +27,7 @@ from robocal_ros.bags.bag_writer import (
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.bags.mcap_files import encode
 from robocal_ros.ground.errors import StorageError
+from robocal_ros.ground.files import draft_beside
 
 TEXT = "std_msgs/msg/String"
 MINE, OTHER = Maker("/recorder_node", "R1"), Maker("/left/recorder_node", "R1")
@@ -122,6 +124,14 @@ def test_what_somebody_put_into_a_recording_stays(tmp_path: Path) -> None:
     assert room.deleted == (old,)
     assert sorted(names(old.iterdir())) == ["frames", "notes.txt"]
     assert "frames, notes.txt" in room.left[old.name]
+
+
+def test_what_a_killed_recorder_did_not_finish_goes_with_its_recording(tmp_path: Path) -> None:
+    old, _ = made(tmp_path, 100), made(tmp_path, 200)
+    for name in (MARKER, KEEP, "metadata.yaml"):
+        draft_beside(old / name).touch()
+    assert make_room(tmp_path, MINE, 0, 0).left == {}
+    assert not old.exists()
 
 
 def test_they_are_ordered_by_what_they_hold(tmp_path: Path) -> None:
@@ -330,6 +340,31 @@ def test_on_a_disk_without_locks_another_hosts_counts_as_open(
 
     monkeypatch.setattr(fcntl, "flock", flock)
     assert is_open(folder)
+
+
+def test_marker_description_and_keep_outlive_a_power_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced, fsync = set(), os.fsync
+
+    def noted(descriptor: int) -> None:
+        synced.add(os.fstat(descriptor).st_ino)
+        fsync(descriptor)
+
+    def are_on_the_disk(*paths: Path) -> bool:
+        found = {path.stat().st_ino for path in paths} <= synced
+        synced.clear()
+        return found
+
+    monkeypatch.setattr(os, "fsync", noted)
+    folder = new_folder(tmp_path, MINE)
+    assert are_on_the_disk(tmp_path, folder, folder / MARKER)
+    with BagRecording(folder, latched=(), file_bytes=10_000) as recording:
+        recording.write("/words", TEXT, bytes(encode(TEXT, {"data": ""})), 1)
+        assert are_on_the_disk(folder, folder / "metadata.yaml")
+    assert are_on_the_disk(folder, folder / "metadata.yaml", *folder.glob("*.mcap"))
+    keep(folder, "a dispute")
+    assert are_on_the_disk(folder, folder / KEEP)
 
 
 def test_two_recordings_of_one_second_have_two_folders(tmp_path: Path) -> None:
