@@ -229,6 +229,8 @@ class BagRecording:
     ``folder``: made where it is not there; see `recording_folders.new_folder`. ``latched``: topics
     that are published latched; may grow. ``file_bytes``: size of a file.
 
+    ``unflushed``: messages that a break-off now may lose.
+
     Raises `StorageError` when it cannot be written; what was written before stays readable.
     """
 
@@ -238,6 +240,7 @@ class BagRecording:
         self._counts: dict[str, int] = {}
         self._files: list[dict[str, Any]] = []
         self._writer: BagWriter | None = None
+        self.unflushed = 0
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._open = hold_open(folder)
@@ -271,6 +274,7 @@ class BagRecording:
         file["start_ns"] = min(file["start_ns"], log_time_ns)
         file["end_ns"] = max(file["end_ns"], log_time_ns)
         file["count"] += 1
+        self.unflushed += 1
         self._types[topic] = msgtype
         self._counts[topic] = self._counts.get(topic, 0) + 1
 
@@ -290,6 +294,7 @@ class BagRecording:
         with suppress(OSError):
             if writer is not None:
                 writer.close()
+                self.unflushed = 0
         self._open.close()
         raise StorageError(f"{self.folder}: removed, moved or replaced while it was recorded")
 
@@ -301,6 +306,7 @@ class BagRecording:
             self._writer.flush()
         except OSError as error:
             raise self._broken(error) from error
+        self.unflushed = 0
 
     def close(self) -> None:
         """Complete the last file, and let go of the folder."""
@@ -332,6 +338,7 @@ class BagRecording:
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.flush()
+            self.unflushed = 0
             writer.close()
             self._describe()
 

@@ -255,9 +255,14 @@ class RecorderNode(HouseNode):
             recording = self._recording or self._begin()
             recording.write(recorded.name, recorded.msgtype, data, self.now_ns())
         except StorageError as error:
-            self._lost += 1
-            self._lost_since = self._lost_since or utc()
+            self._lose(1)
             self._break_off(error)
+
+    def _lose(self, messages: int) -> None:
+        """Count what is not recorded."""
+        if messages:
+            self._lost += messages
+            self._lost_since = self._lost_since or utc()
 
     def _begin(self) -> BagRecording:
         if self._again_s is not None:
@@ -274,7 +279,9 @@ class RecorderNode(HouseNode):
         return self._recording
 
     def _break_off(self, error: StorageError) -> None:
-        self._recording = None
+        recording, self._recording = self._recording, None
+        if recording is not None:  # what no flush brought to the disk goes with it
+            self._lose(recording.unflushed)
         if not self._fault:
             self.get_logger().error(str(error))
         if self._again_s is None:
@@ -348,12 +355,12 @@ class RecorderNode(HouseNode):
             self._break_off(error)
 
     def _complete(self) -> None:
-        recording, self._recording = self._recording, None
         try:
-            if recording is not None:
-                recording.close()
+            if self._recording is not None:
+                self._recording.close()
         except StorageError as error:
             self._break_off(error)
+        self._recording = None
 
     # ---- services -------------------------------------------------------------------------------
 

@@ -107,3 +107,4 @@ def test_a_disk_that_takes_no_more_is_told_and_what_it_took_is_read(tmp_path):
     found = numbers(tmp_path / "r")
     assert found == list(range(len(found)))
     assert len(found) >= 40
+    assert recording.messages - len(found) == recording.unflushed > 0

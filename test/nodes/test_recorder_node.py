@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
+import errno
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ from robocal_ros.bags.bag_writer import (
     KEEP,
     MB,
     BagRecording,
+    BagWriter,
     Maker,
     new_folder,
     recordings,
@@ -154,6 +156,23 @@ def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_
     assert set(words(folder, "/words")) <= {"again"}
     with BagReader(folder) as bag:
         assert [m.message.command for m in bag.messages(["/events"])] == commands
+
+
+def test_what_no_flush_brought_to_the_disk_counts_as_not_recorded(graph, monkeypatch):
+    def full(writer: BagWriter) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    given = {"topics": ["words"], "folder": str(graph.state / "rec"), "flush_s": 60.0}
+    node = graph.add(RecorderNode, given)
+    publisher = graph.publisher(String, "/words")
+    for i in range(10):
+        said(graph, publisher, String, f"{i}")
+    graph.spin_until(lambda: node.health().values["/words recorded"] == 10, "all came")
+    monkeypatch.setattr(BagWriter, "flush", full)
+    graph.call(Trigger, f"/{NODE}/split")
+    health = node.health()
+    assert (health.level, health.values["messages not recorded"]) == (ERROR, 10)
+    assert "10 messages since 20" in health.message
 
 
 def test_a_recording_whose_folder_is_removed_is_told_and_begun_anew(graph, monkeypatch):
