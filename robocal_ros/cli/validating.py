@@ -75,6 +75,7 @@ Truth = Sequence[tuple[int, Array]]  # stamps, ns, and transforms (4, 4) from th
 HOUR_NS = 3.6e12
 ACCURACY = "accuracy_state"
 ROUTINE = (events.START, events.CAPTURE, events.SAMPLE, events.TOOL_STEP, events.STEP_BEGINS)
+LISTED = "its decisions follow from what no recording holds: they are listed as recorded"
 _EVERY_ENTRY = 1_000_000
 
 
@@ -119,7 +120,8 @@ def validate_bag(job: Job) -> Validated:
             }
             recordings, skipped, others = _recordings(reader)
             if not recordings and not skipped:
-                recordings = [open_recording(reader, job.topics)]
+                skipped = dict.fromkeys(others, LISTED)
+                recordings = [] if others else [open_recording(reader, job.topics)]
             truth = BagTruth(reader)
             sessions = [_SessionReplay(job, recording, truth).judged() for recording in recordings]
             courses = cell_courses(reader, truth)

@@ -112,6 +112,17 @@ def validate(tmp_path_factory: pytest.TempPathFactory):
     return run
 
 
+def refused(stamp_ns: int, words: str) -> dict[str, Any]:
+    """An event of a node whose decisions nothing can replay."""
+    command = Command("run_maintenance", {}, stamp_ns)
+    return {
+        "stamp": ros_time(stamp_ns),
+        "command": command.name,
+        "arguments": arguments_text(command),
+        "outcome": outcome_text(Outcome(command, Code.LIMIT_EXCEEDED, words)),
+    }
+
+
 def judged(bags: Path) -> tuple[object, ...]:
     """Words for a bag with a truth, and one of another robot."""
     return bags / "judged.mcap", TOOL_RUNS, "--robot", ROBOT
@@ -199,15 +210,8 @@ class TestRecordedSession:
                     continue
                 bag.write(recorded.topic, recorded.msgtype, recorded.message, late_ns)
             for stamp_ns, words in ((START_NS, "before"), (late_ns + NS, "too short")):
-                command = Command("run", {}, stamp_ns)
-                event = {
-                    "stamp": ros_time(stamp_ns),
-                    "command": command.name,
-                    "arguments": arguments_text(command),
-                    "outcome": outcome_text(Outcome(command, Code.LIMIT_EXCEEDED, words)),
-                }
-                log_ns = max(late_ns, stamp_ns)
-                bag.write("/plc/session_events", TYPES[EVENTS], event, log_ns)
+                event = refused(stamp_ns, words)
+                bag.write("/plc/session_events", TYPES[EVENTS], event, max(late_ns, stamp_ns))
             for recorded in read_bag(bags / "live.mcap"):
                 given = recorded.topic, recorded.msgtype, recorded.message
                 if recorded.log_time_ns >= late_ns:
@@ -229,6 +233,23 @@ class TestRecordedSession:
         (late,), (_, second) = (r["bags"][0]["sessions"][0]["cycles"] for r in (report, whole))
         for name in ("in_force", "candidate", "measured", "drift", "sigma", "verdict"):
             assert late[name] == second[name], name
+
+
+    def test_a_maintenance_nodes_decisions_alone_are_listed(self, bags, validate, tmp_path) -> None:
+        path, topic = tmp_path / "decided.mcap", "/maintenance_node/session_events"
+        at_ns = START_NS + NS
+        with BagWriter(path) as bag:
+            for recorded in read_bag(bags / "plain.mcap"):
+                given = recorded.topic, recorded.msgtype, recorded.message
+                bag.write(*given, recorded.log_time_ns)
+            bag.write(topic, TYPES[EVENTS], refused(at_ns, "too short"), at_ns)
+        status, document, out, report = validate(path)
+        assert status == 0
+        (row,) = document["bags"]
+        assert (row["node"], "they are listed" in row["skipped"]) == (topic, True)
+        (decision,) = report["bags"][0]["other_decisions"][topic]
+        assert (decision["command"], decision["message"]) == ("run_maintenance", "too short")
+        assert f"Decisions of {topic}" in (out / "report.html").read_text()
 
 
 class TestTruth:
