@@ -324,7 +324,7 @@ def tool_runs(replayed: Document, truth: Truth) -> list[Document]:
                 "tcp_mm": run.get("tcp_mm"),
                 "change_mm": change.get("tip_mm"),
                 "change_deg": change.get("axis_deg"),
-                "sigma_mm": float(np.linalg.norm(sigma)) if isinstance(sigma, list) else sigma,
+                "sigma_mm": float(np.max(sigma)) if isinstance(sigma, list) else sigma,
                 "misfit_mm": run.get("misfit_mm"),
                 "true_error_mm": error,
                 "verdict": run["verdict"],

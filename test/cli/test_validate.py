@@ -41,7 +41,7 @@ from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter, read_bag
 from robocal_ros.cli.main import main
 from robocal_ros.cli.validate import validated
-from robocal_ros.cli.validating import Job, require_finite
+from robocal_ros.cli.validating import Job, require_finite, tool_runs
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL
@@ -234,7 +234,6 @@ class TestRecordedSession:
         for name in ("in_force", "candidate", "measured", "drift", "sigma", "verdict"):
             assert late[name] == second[name], name
 
-
     def test_a_maintenance_nodes_decisions_alone_are_listed(self, bags, validate, tmp_path) -> None:
         path, topic = tmp_path / "decided.mcap", "/maintenance_node/session_events"
         at_ns = START_NS + NS
@@ -250,6 +249,12 @@ class TestRecordedSession:
         (decision,) = report["bags"][0]["other_decisions"][topic]
         assert (decision["command"], decision["message"]) == ("run_maintenance", "too short")
         assert f"Decisions of {topic}" in (out / "report.html").read_text()
+
+    def test_a_full_tool_runs_sigma_is_the_one_that_was_told_live(self) -> None:
+        """The largest of the axes, as of the action ``measure``."""
+        run = {"run": 1, "stamp": 1.0, "sigma_mm": [0.02, 0.01, 0.02], "verdict": {}}
+        (told,) = tool_runs({"runs": [run]}, [])
+        assert told["sigma_mm"] == 0.02
 
 
 class TestTruth:
