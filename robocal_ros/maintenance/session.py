@@ -27,7 +27,7 @@ from robocal_ros.maintenance.accuracy import (
     NodeReports,
     accuracy_of,
 )
-from robocal_ros.maintenance.cycle import CycleRun, ThermalCycle, ThermalPart
+from robocal_ros.maintenance.cycle import CycleRun
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.fixture_part import FixturePart, FixtureVisits
 from robocal_ros.maintenance.mover import FaultError, Ways
@@ -37,6 +37,7 @@ from robocal_ros.maintenance.robot_interface import (
     DriverRequest,
     Script,
 )
+from robocal_ros.maintenance.thermal_part import ThermalCycle, ThermalPart
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import Accuracy
 from robocal_ros.tool.session import FULL, LASER, QUICK
