@@ -111,9 +111,7 @@ class ToolPart:
         if wanted == QUICK:
             if not (yield from self._check(f"{cycle_id}/check", goes_on=True)):
                 return
-            record, every_s = self._memory.tool, self._cell.config.full_every_s
-            recent = every_s <= 0.0 or 0.0 <= self._age_s(record.full_ns) < every_s
-            if record.answer == "pass" and recent:
+            if self._memory.tool.answer == "pass" and not self._full_is_due():
                 return
         candidate = yield from self._measured_anew(f"{cycle_id}/full")
         if candidate and not (yield from self._ask_mandrel(cycle_id, candidate)):
@@ -172,7 +170,13 @@ class ToolPart:
             return FULL
         if not known or record.answer == "failed":
             return QUICK
-        return QUICK if self._age_s(record.wall_ns) >= config.check_every_s else ""
+        due = self._age_s(record.wall_ns) >= config.check_every_s or self._full_is_due()
+        return QUICK if due else ""
+
+    def _full_is_due(self) -> bool:
+        """By ``full_every_s``; a check comes before it."""
+        every_s = self._cell.config.full_every_s
+        return every_s > 0.0 and not 0.0 <= self._age_s(self._memory.tool.full_ns) < every_s
 
     def _age_s(self, wall_ns: int) -> float:
         return (self.wall_ns - wall_ns) / NS

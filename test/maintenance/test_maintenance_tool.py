@@ -21,6 +21,7 @@ from maintenance_tools import (
     decide,
     level,
     measured_in_full,
+    modes,
     until_measuring,
 )
 
@@ -64,6 +65,17 @@ def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(
     assert level(cell) is AccuracyLevel.DEGRADED
     cell.open_gap()
     assert a_check_passes(cell, "c3").complete
+
+
+def test_a_full_measurement_comes_when_it_is_due_though_no_check_is(history, monkeypatch):
+    cell = opened(history, config=config_of(check_every_s=7200.0, full_every_s=3600.0))
+    begun_ns, found = maintenance_cell.WALL_NS, []
+    for name, later_s in (("c1", 0), ("c2", 1800), ("c3", 4000)):
+        monkeypatch.setattr(maintenance_cell, "WALL_NS", begun_ns + later_s * 10**9)
+        cell.log.clear()
+        assert cell.ran(name).complete
+        found.append(modes(cell))
+    assert found == [["quick", "full"], [], ["quick", "full"]]
 
 
 def test_a_first_check_that_fails_leaves_the_tool_unknown(cell):
