@@ -421,7 +421,7 @@ def _tool(
     same = record.is_of(tool)
     error = _tool_error(record, tool) if same else None
     if age_s > config.tool_expires_s:
-        return Accuracy(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
+        return Accuracy(AccuracyLevel.EXPIRED, f"tool: {when}, {record.words}", error, due_in_s)
     if record.answer == "failed":
         return Accuracy(AccuracyLevel.DEGRADED, f"tool: {record.words}", None, 0.0)
     if record.candidate and record.candidate == tool.calibration_id:

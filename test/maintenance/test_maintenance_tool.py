@@ -251,6 +251,7 @@ def test_a_station_that_moved_degrades_until_a_check_passes(cell):
     result = cell.ran("c1")
     assert (result.tool_found_code, result.tool_code) == (Code.STATION_MOVED, Code.STATION_MOVED)
     assert result.accepted == ()
-    assert level(cell) is AccuracyLevel.DEGRADED
-    assert words in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
+    for later_ns, said in ((0, AccuracyLevel.DEGRADED), (DAY_NS, AccuracyLevel.EXPIRED)):
+        assert level(cell, later_ns) is said
+        assert words in cell.session.accuracy(cell.now_s, cell.wall_ns + later_ns).reason
     a_check_passes(cell, "c2")
