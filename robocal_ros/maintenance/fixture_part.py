@@ -63,18 +63,20 @@ class FixturePart:
             return None, ""
         cell.robot.ways = ways  # from home, where both rings begin
         poses = np.tile(np.arange(1, ways.count + 1), cell.config.fixture_visits).tolist()
-        if words := cell.too_short(self.worst_s()):
-            left = f"{MEASUREMENT}, {len(poses) - visits.done} poses"
-            return DriverAnswer(Code.LIMIT_EXCEEDED, f"{words}: {EACH_POSE}"), left
-        if not visits.done or cell.now_s - visits.last_s > cell.config.resume_within_s:
+        if cell.now_s - visits.last_s > cell.config.resume_within_s:
             self._forget()
-            begun = yield from cell.ask(self._times.answer_s, NODE, BeginFixture)
-            if not begun.done:
-                return begun, MEASUREMENT
-        yield from self._visit(poses)
-        yield from cell.go_home()
-        if unvisited := len(poses) - visits.done:
-            return None, f"{MEASUREMENT}, {unvisited} poses"
+        if todo := len(poses) - visits.done:
+            if words := cell.too_short(self.worst_s()):
+                left = f"{MEASUREMENT}, {todo} poses"
+                return DriverAnswer(Code.LIMIT_EXCEEDED, f"{words}: {EACH_POSE}"), left
+            if not visits.done:
+                begun = yield from cell.ask(self._times.answer_s, NODE, BeginFixture)
+                if not begun.done:
+                    return begun, MEASUREMENT
+            yield from self._visit(poses)
+            yield from cell.go_home()
+            if unvisited := len(poses) - visits.done:
+                return None, f"{MEASUREMENT}, {unvisited} poses"
         if not cell.fits(self._times.solve_s):
             return None, f"end of the {MEASUREMENT}"
         return (yield from self._judged())

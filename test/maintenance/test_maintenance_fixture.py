@@ -107,6 +107,14 @@ def test_a_gap_that_is_too_short_for_any_pose_says_which_would_do(lone):
     assert kinds(lone).count("Move") >= 2
 
 
+def test_a_gap_that_is_too_short_for_a_pose_judges_where_all_are_visited(lone):
+    visits = lone.session._visits
+    visits.done, visits.last_s = len(WAYS), lone.now_s
+    result = lone.ran("c1", 10.0)
+    assert (result.complete, result.fixture_code) == (True, Code.ACCEPT), result.message
+    assert kinds(lone) == ["MeasureFixture"]
+
+
 @pytest.mark.parametrize("step", ["fixture", "thermal"])
 def test_a_pose_is_reached_from_one_side_in_whatever_gap(step, history):
     """From the other a joint's backlash is in the comparison with what was taught, or the cold."""
