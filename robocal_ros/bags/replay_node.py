@@ -87,6 +87,14 @@ class ReplayTopics:
         )
         self.played[topic] = Played(name, self._node.create_publisher(kind, name, profile))
 
+    def begin(self) -> None:
+        """Count from here on: the bag is played from its start."""
+        self.unacknowledged = 0
+        self._in_flight.clear()
+        for played in self.played.values():
+            played.sent = played.unheard = 0
+            played.untracked.clear()
+
     def publish(self, topic: str, cdr: bytes) -> None:
         """Send a message; the caller calls ``settle`` before ``DEPTH`` of them are in flight."""
         played = self.played[topic]
@@ -312,6 +320,7 @@ class ReplayNode(HouseNode):
         if self._reader is None or self._topics is None:
             self._set_state(NO_BAG)
             return
+        self._topics.begin()
         self._messages: Iterator[BagMessage] = self._reader.messages(
             list(self._topics.played), raw=True
         )

@@ -314,6 +314,21 @@ def test_what_is_damaged_in_the_bag_counts_as_lost(graph, tmp_path):
     assert f"done: {told}" in process.output
 
 
+def test_a_bag_that_is_played_again_has_counts_of_its_own(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 100, 1_000_000)
+    listener = Listener(graph)
+    node = graph.add(ReplayNode, {"bag": str(bag), "rate": 0.0})
+    listener.until("done")
+    node._topics.unacknowledged = 3  # as of a subscriber that was stopped
+    node.trigger_deactivate()
+    listener.until("paused")
+    assert listener.status["lost"]
+    node.trigger_activate()
+    listener.until("done")
+    assert listener.status["sent"]["/joint_states"] == 100
+    assert (listener.status["unacknowledged"], listener.status["lost"]) == (0, [])
+
+
 def test_what_may_be_lost_is_said_in_the_same_way_and_ends_alike(graph, tmp_path):
     """A reader that confirms nothing, and one that is stopped before it can."""
     bag = write_bag(tmp_path / "shift.mcap", 100, 20_000_000)
