@@ -28,6 +28,7 @@ from robocal_ros.tool.run import taught_apart
 
 NS, MM = 1_000_000_000, 1e-3
 REMEMBERED = 200  # ended cycles
+UNKNOWN = ToolError(-1.0, -1.0)  # as it is kept
 VERSION = 2  # of the document; one without a version is the first, which knew no runs and stamps
 
 
@@ -194,7 +195,8 @@ class ToolRecord:
     wall_ns: int = 0
     full_ns: int = 0
     laser_ns: int = 0  # when the beams were found last, or were not found
-    # drift_rms_m, drift_bound_m: error of the thermal model through which a tool was last measured
+    # drift_rms_m, drift_bound_m: error of the thermal model through which a tool was last measured;
+    # `UNKNOWN`: the drift was not known
     drift_rms_m: float = 0.0
     drift_bound_m: float = 0.0
     taught: Sequence[Sequence[float]] = ()  # T_flange_tool (4, 4) of then; empty: not known
@@ -446,12 +448,16 @@ def _tool(
     return Accuracy(AccuracyLevel.OK, f"tool: {when}, {record.words}", error, due_in_s)
 
 
-def _tool_error(record: ToolRecord, tool: Head) -> ToolError:
-    """What a check found, and what none sees: the drift that went into a measured tool."""
+def _tool_error(record: ToolRecord, tool: Head) -> ToolError | None:
+    """What a check found, and what none sees: the drift that went into a measured tool.
+
+    None where that is not known.
+    """
     found = offset_error(record.deviation_mm * MM, record.sigma_mm * MM)
     if tool.calibration_id is None:
         return found
-    return both_errors(ToolError(record.drift_rms_m, record.drift_bound_m), found)
+    drift = ToolError(record.drift_rms_m, record.drift_bound_m)
+    return None if drift == UNKNOWN else both_errors(drift, found)
 
 
 class NodeReports:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL, Head
-from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
+from robocal_ros.maintenance.accuracy import UNKNOWN, CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
 from robocal_ros.maintenance.fixture_part import JUDGED, FixturePart, FixtureVisits
 from robocal_ros.maintenance.fixture_part import MEASUREMENT as FIXTURE_MEASUREMENT
@@ -286,7 +286,8 @@ class ToolPart:
         )
         if full:
             memory.note_tool(full_ns=self.wall_ns)
-            if answer.done and (drift := self._drift()) is not None:
+            if answer.done:
+                drift = self._drift() or UNKNOWN
                 memory.note_tool(drift_rms_m=drift.rms_m, drift_bound_m=drift.bound_m)
         elif outcome.accepted and verdict == "recalibrate":
             failed = f"tool {outcome.candidate_id} failed its check and is still in force"
@@ -547,6 +548,8 @@ class CycleRun:
         return f"the drift is {drift.level.name}: {drift.reason}" if drift.level >= worst else ""
 
     def _drift_error(self) -> ToolError | None:
-        """Of the thermal model in force; without poses nobody asks."""
-        drift = self._drift() if self._cell.ways.count else None
+        """Of the thermal model in force, None where it is not known; without poses nobody asks."""
+        if not self._cell.ways.count:
+            return ToolError(0.0, 0.0)
+        drift = self._drift()
         return None if drift is None else drift.error

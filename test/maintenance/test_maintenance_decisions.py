@@ -14,6 +14,8 @@ from maintenance_cell import (
     LONG_S,
     POSES,
     Cell,
+    bent,
+    config_of,
     kinds,
     opened,
     over,
@@ -144,6 +146,20 @@ def test_the_drift_that_went_into_a_tool_counts_as_long_as_that_tool(history):
     said = cell.session.accuracy(cell.now_s, cell.wall_ns)
     assert said.error.rms_m == pytest.approx(np.hypot(1e-4, 1e-5), rel=1e-9)
     assert said.error.bound_m > 1.5e-4
+
+
+@pytest.mark.parametrize("poses", [POSES, POSES[:0]])
+def test_of_a_tool_that_was_measured_through_an_unknown_drift_no_error_is_predicted(history, poses):
+    """Also once the drift is known again; a cell without measuring poses asks for none."""
+    unknown = replace(KNOWN, level=AccuracyLevel.EXPIRED, error=None)
+    cell = opened(history, config=config_of(poses=poses), check=bent(), drift=unknown)
+    number = measured_in_full(cell)
+    cell.finish()
+    decide(cell, ACCEPT, number)
+    cell.check = passed()
+    cell.ran("c2")
+    assert level(cell) is AccuracyLevel.OK
+    assert (cell.session.accuracy(cell.now_s, cell.wall_ns).error is None) == bool(len(poses))
 
 
 def test_what_a_person_chose_meanwhile_is_not_taken_back(history):
