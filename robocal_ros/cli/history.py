@@ -33,7 +33,6 @@ from robocal_ros.history.history_records import (
     fixture_kind,
     hand_eye_kind,
 )
-from robocal_ros.session.events import measured_with
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -331,7 +330,7 @@ def _accept(history: CalibrationHistory, args: argparse.Namespace) -> "HistoryDe
         reason=args.reason,
         expected_head=args.expect_revision,
         wall_ns=time.time_ns(),
-        with_heads=measured_with(history, history.get(args.id)),
+        with_heads=history.measured_with(args.id),
     )
     said = f"calibration {args.id} is in force as {head.kind} revision {head.revision}"
     return _decided(history, args, head.kind, args.id, head.revision, said)

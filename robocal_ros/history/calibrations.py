@@ -59,6 +59,7 @@ from robocal_ros.history.history_records import (
     insert_correction,
     insert_decision,
     insert_proposal,
+    measured_with,
     packed,
 )
 
@@ -250,8 +251,8 @@ class Ledger:
 
 _log = logging.getLogger(__name__)
 
-# As `Ledger.state`, but without reading those that were refused or decided.
-_PENDING = (
+# PENDING as `Ledger.state` has it, but without reading those that were refused or decided.
+_UNDECIDED = (
     "WHERE kind = ? AND based_on = ? AND code = ? AND NOT EXISTS (SELECT 1 FROM decisions "
     "WHERE calibration_id = calibrations.id AND action <> 'rollback') ORDER BY id DESC LIMIT ?"
 )
@@ -286,6 +287,7 @@ class HistoryReader:
         self._ledger = ledger
         self._model_hash = model_hash
         self._own_commits = 0
+        self._needed: dict[int, dict[str, int]] = {}  # see `measured_with`; by id, never changes
 
     @classmethod
     def open(
@@ -398,10 +400,19 @@ class HistoryReader:
             return self._entry(calibration_id, read_candidate(connection, calibration_id))
 
     def pending(self, kind: str = THERMAL, limit: int = -1) -> tuple[Entry, ...]:
-        """Calibrations that can be accepted now, newest first; ``limit``: so many at the most."""
+        """Calibrations that can be accepted now, newest first; ``limit``: see `undecided`."""
+        found = self.undecided(kind, limit)
+        return tuple(entry for entry in found if entry.state is CalibrationState.PENDING)
+
+    def undecided(self, kind: str = THERMAL, limit: int = -1) -> tuple[Entry, ...]:
+        """Calibrations that were solved against the revision in force, newest first.
+
+        Those too that are stale for what else they were measured with. ``limit``: so many at the
+        most.
+        """
         with self._reading() as connection:
             revision, _ = self._ledger.head(kind)
-            rows = read_candidates(connection, _PENDING, kind, revision, Code.ACCEPT, limit)
+            rows = read_candidates(connection, _UNDECIDED, kind, revision, Code.ACCEPT, limit)
             return tuple(self._entry(*row) for row in rows)
 
     def decisions(self, after_seq: int = 0, newest: int = -1) -> tuple[Decision, ...]:
@@ -427,6 +438,14 @@ class HistoryReader:
         with self._reading() as connection:
             return read_json(connection, calibration_id, "model")
 
+    def measured_with(self, calibration_id: int) -> dict[str, int]:
+        """Revisions, by kind, beside which alone it may come into force.
+
+        Raises `InputError` for an unknown id.
+        """
+        with self._reading() as connection:
+            return self._needs(calibration_id, read_candidate(connection, calibration_id))
+
     def inputs(self, calibration_id: int) -> "dict[str, NDArray[Any]]":
         """Arrays it was solved from, bit for bit. Raises `InputError` for an unknown id."""
         with self._reading() as connection:
@@ -444,13 +463,30 @@ class HistoryReader:
 
     def _entry(self, calibration_id: int, candidate: Candidate) -> Entry:
         standing = self._ledger.standing(calibration_id)
+        state = self._ledger.state(calibration_id, candidate)
+        if state is CalibrationState.PENDING and self._is_outdated(calibration_id, candidate):
+            state = CalibrationState.STALE
         return Entry(
             **vars(candidate),
             id=calibration_id,
-            state=self._ledger.state(calibration_id, candidate),
+            state=state,
             revision=standing.revision,
             decisions=standing.decisions,
         )
+
+    def _needs(self, calibration_id: int, candidate: Candidate) -> dict[str, int]:
+        if calibration_id not in self._needed:
+            model = read_json(self._file.connection, calibration_id, "model")
+            self._needed[calibration_id] = measured_with(candidate.kind, model)
+        return self._needed[calibration_id]
+
+    def _is_outdated(self, calibration_id: int, candidate: Candidate) -> bool:
+        """Whether it was measured with another revision, of another kind, than is in force."""
+        try:
+            needed = self._needs(calibration_id, candidate)
+        except DamagedError:  # told where its model is used
+            return False
+        return any(self._ledger.head(kind)[0] != its for kind, its in needed.items())
 
     def _head(self, kind: str, revision: int, calibration_id: int | None) -> Head:
         model = None
@@ -512,7 +548,9 @@ class CalibrationHistory(HistoryReader):
                     f"the proposal is based on {proposal.kind} revision {proposal.based_on}, but "
                     f"this history has only come to {revision}: read the one in force again"
                 )
-            return insert_proposal(connection, proposal, payloads)
+            number = insert_proposal(connection, proposal, payloads)
+        self._needed[number] = measured_with(proposal.kind, proposal.model)
+        return number
 
     def accept(
         self,

@@ -68,7 +68,7 @@ class CalibrationState(StrEnum):
     PENDING = "pending"
     """Can be accepted now."""
     STALE = "stale"
-    """Was solved against a revision that is no longer in force; measure again."""
+    """Was solved against, or measured with, a revision no longer in force; measure again."""
     REFUSED = "refused"
     """Its own verdict is not ACCEPT; kept for the record, can never be accepted."""
     REJECTED = "rejected"
@@ -202,6 +202,24 @@ class Entry(Candidate):
             "method": self.method,
             "decisions": [made.document() for made in self.decisions],
         }
+
+
+def measured_with(kind: str, model: Mapping[str, Any]) -> dict[str, int]:
+    """Revisions, by kind, beside which alone a calibration may come into force.
+
+    A tool's flange poses came from a thermal model: with another one, what the drift did to the
+    flange would stay in the tool, and be corrected a second time. Frames were shifted for one. A
+    drift is counted from a cold reference: the one in force from then on knows another cold robot.
+    A fixture's points were placed by tool or sensor: what these erred would stay in its frame.
+    """
+    told: Mapping[str, Any] = {}
+    if kind in (TOOL, FRAME_SHIFT):
+        told = {THERMAL: model.get("thermal_revision")}
+    elif kind == THERMAL:
+        told = {REFERENCE: model.get("reference_revision")}
+    elif kind.split("/")[0] == FIXTURE:
+        told = model.get("measured_with", {})
+    return {its: int(revision) for its, revision in told.items() if revision is not None}
 
 
 def require_measured_with(

@@ -40,7 +40,6 @@ from robocal_ros.session.events import (
     Command,
     Outcome,
     decide,
-    measured_with,
 )
 from robocal_ros.thermal.reference import commissioned_of
 from robocal_ros.tool.judging import KnownTool, change_between
@@ -67,18 +66,12 @@ class Decider:
     ) -> None:
         self._nominal, self._history, self._config = nominal, history, config
 
-    def _waiting(self, kind: str) -> list[Entry]:
-        """Candidates that can be accepted now, newest first, one more than is decided at once."""
-        found = self._history.pending(kind, MOST_AT_ONCE + 1)
-        return [entry for entry in found if not self._outdated(entry)]
-
     def newest(self, kind: str) -> Entry | None:
-        """The first of them, however many there are; None where nothing waits.
+        """The newest candidate, where it can be accepted now; None where nothing waits.
 
         Where the newest is outdated, those measured before it are too: revisions only grow.
         """
-        found = self._history.pending(kind, 1)
-        return found[0] if found and not self._outdated(found[0]) else None
+        return next(iter(self._history.pending(kind, 1)), None)
 
     def _outdated(self, entry: Entry) -> str:
         """Why it is STALE although its own kind's revision is in force; else empty."""
@@ -89,7 +82,7 @@ class Decider:
         return ""
 
     def _require_beside(self, entry: Entry) -> None:
-        needed = measured_with(self._history, entry)
+        needed = self._history.measured_with(entry.id)
         require_measured_with(f"{entry.kind} {entry.id}", needed, self.revision)
 
     def head(self, kind: str) -> Head:
@@ -141,13 +134,13 @@ class Decider:
             return Outcome(
                 command, Code.ACCEPT, words, None, calibration_id, head.revision, repeated=True
             )
+        if name == ACCEPT:
+            self._require_beside(entry)
         if name == ACCEPT and entry.state is CalibrationState.STALE:
             raise StaleError(
                 f"calibration {calibration_id} was solved against revision {entry.based_on}, in "
                 f"force is {head.revision}: measure again"
             )
-        if name == ACCEPT:
-            self._require_beside(entry)
         return self._carried_out(command, entry.kind, head.revision, wall_ns)
 
     def roll_back(self, kind: str, revision: int, by: str, why: str, wall_ns: int) -> Outcome:
@@ -182,7 +175,7 @@ class Decider:
         if name == ACCEPT:
             yield self.decide(name, self._meant(by, wall_ns), by, "", wall_ns)
             return
-        found = [self._waiting(kind) for kind in KINDS]
+        found = [self._history.pending(kind, MOST_AT_ONCE + 1) for kind in KINDS]
         waiting = [entry.id for entries in found for entry in entries[:MOST_AT_ONCE]]
         if not waiting:
             yield _nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")
@@ -239,10 +232,8 @@ class Decider:
         bounds = self._config.bounds
         if not bounds.automatic:
             return "auto_accept is off"
-        if words := self.decided(calibration_id):
-            return words
         entry = self._history.get(calibration_id)
-        if words := self._outdated(entry):
+        if words := self._outdated(entry) or self.decided(calibration_id):
             return words
         if entry.kind != THERMAL:
             return self._tool_withheld(calibration_id)

@@ -563,10 +563,10 @@ class DecisionServices:
         return response
 
     async def _reject_twin(self, request: Any, response: Any) -> Any:
-        """Reject all that is pending: a PLC's way out when the accept twin may not choose."""
+        """Reject all that is undecided: a PLC's way out when the accept twin may not choose."""
         reject_one = twin(self._ask, REJECT, {"choose": NEWEST})
         await reject_one(request, response)
-        while response.success and self._history.pending(self._kind):
+        while response.success and self._history.undecided(self._kind):
             await reject_one(request, response)
         return response
 

@@ -19,13 +19,10 @@ from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample, J
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
     BEFORE_ANY,
-    FIXTURE,
-    FRAME_SHIFT,
-    REFERENCE,
     THERMAL,
     TOOL,
+    CalibrationState,
     Decision,
-    Entry,
     Head,
     Proposal,
 )
@@ -283,7 +280,7 @@ def decide(
                 reason=why,
                 expected_head=expected,
                 wall_ns=wall_ns,
-                with_heads=measured_with(history, history.get(chosen)),
+                with_heads=history.measured_with(chosen),
             )
         else:
             head = history.rollback(
@@ -302,30 +299,14 @@ def decide(
     return Outcome(command, Code.ACCEPT, message, None, chosen, head.revision)
 
 
-def measured_with(history: CalibrationHistory, entry: Entry) -> dict[str, int]:
-    """Revisions, by kind, beside which alone a calibration may come into force.
-
-    A tool's flange poses came from a thermal model: with another one, what the drift did to the
-    flange would stay in the tool, and be corrected a second time. Frames were shifted for one. A
-    drift is counted from a cold reference: the one in force from then on knows another cold robot.
-    A fixture's points were placed by tool or sensor: what these erred would stay in its frame.
-    """
-    model = history.model(entry.id)
-    if entry.kind in (TOOL, FRAME_SHIFT):
-        return {THERMAL: int(model["thermal_revision"])}
-    if entry.kind == THERMAL and "reference_revision" in model:  # older ones do not tell
-        return {REFERENCE: int(model["reference_revision"])}
-    if entry.kind.split("/")[0] == FIXTURE:
-        return {kind: int(its) for kind, its in model.get("measured_with", {}).items()}
-    return {}
-
-
 def named(history: CalibrationHistory, command: Command, kind: str) -> Command:
     """Put the candidate's id, or why there is none (``refused``), in place of ``choose``."""
     if "choose" not in command.arguments:
         return command
     arguments = dict(command.arguments)
-    pending = [entry.id for entry in history.pending(kind)]
+    undecided = history.undecided(kind)
+    pending = [entry.id for entry in undecided if entry.state is CalibrationState.PENDING]
+    pending = pending or [entry.id for entry in undecided[:1]]  # its refusal says why it is stale
     choose = arguments.pop("choose")
     if not pending:
         first = FIRST.get(kind, "calibrate")

@@ -13,6 +13,7 @@ from history_workers import proposal
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Action, CalibrationState, Head
+from robocal_ros.session.events import ACCEPT, ONLY, Command, named
 
 
 class TestProposals:
@@ -222,6 +223,23 @@ class TestDecisions:
             history.accept(tool, with_heads={"thermal": 0}, **BY)
         assert history.get(tool).state is CalibrationState.PENDING
         assert history.accept(tool, with_heads={"thermal": 1}, **BY).revision == 1
+
+    def test_what_was_measured_with_another_revision_does_not_wait(
+        self, history: CalibrationHistory
+    ) -> None:
+        """Of another kind, as a tool of a thermal model: it blocks no acceptance without an id."""
+        old = history.propose(proposal(kind="tool", model={"thermal_revision": 0}))
+        assert history.get(old).state is CalibrationState.PENDING
+        history.accept(history.propose(proposal()), **BY)
+        only = Command(ACCEPT, {"choose": ONLY})
+        assert named(history, only, "tool").arguments == {"id": old}  # is refused with its reason
+        new = history.propose(proposal(kind="tool", model={"thermal_revision": 1}))
+        with reopened(history) as other:
+            for each in (history, other):
+                assert [each.get(n).state.value for n in (old, new)] == ["stale", "pending"]
+                assert [entry.id for entry in each.pending("tool")] == [new]
+                assert each.list()[-1].state is CalibrationState.STALE
+        assert named(history, only, "tool").arguments == {"id": new}
 
     def test_kinds_have_revisions_of_their_own(self, history: CalibrationHistory) -> None:
         thermal = history.propose(proposal())
