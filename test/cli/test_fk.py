@@ -202,8 +202,9 @@ def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_joint_functions_have_the_unit_of_their_joint(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "120")  # of 80 a cell takes two lines
     path = tmp_path / "full.yaml"
     save_robot(with_joint_errors(load_description("p1r2p3").arm, 2), path)
     assert main(["joint-functions", "--robot", str(path)]) == 0
