@@ -473,7 +473,9 @@ def new_folder(parent: Path, maker: Maker, wall_ns: int | None = None) -> Path:
             text = json.dumps(mark | {"software": __version__})
             write_text(folder / MARKER, f"{text}\n", durable=True)
         except InputError:
-            folder.rmdir()
+            with suppress(OSError):  # the reason is the one to tell
+                (folder / MARKER).unlink(missing_ok=True)
+                folder.rmdir()
             raise
         sync_folder(parent)
     except (OSError, InputError) as error:

@@ -3,6 +3,7 @@
 
 import contextlib
 import difflib
+import errno
 import fcntl
 import json
 import os
@@ -16,6 +17,7 @@ from typing import Any
 from robocal_ros.ground.errors import ConflictError, InputError, StateLostError, StorageError
 
 MOST_QUOTED = 60
+NO_SYNC = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP}  # shares that cannot sync a folder
 
 
 def quoted(value: object) -> str:
@@ -113,10 +115,13 @@ def lies_at(path: Path, descriptor: int) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk; an `OSError` where that fails."""
+    """Bring the names in a folder to the disk, where it can; an `OSError` where that fails."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in NO_SYNC:
+            raise
     finally:
         os.close(descriptor)
 

@@ -421,7 +421,9 @@ def _tool(
         return Accuracy(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     when = f"checked {age_s / 60.0:.0f} min ago"
     same = record.is_of(tool)
-    error = _tool_error(record, tool) if same else None
+    error = None
+    if same and record.answer != "failed":  # what an older check found holds no more
+        error = _tool_error(record, tool)
     if age_s > config.tool_expires_s:
         return Accuracy(AccuracyLevel.EXPIRED, f"tool: {when}, {record.words}", error, due_in_s)
     if record.answer == "failed":

@@ -170,7 +170,9 @@ class ToolPart:
             return FULL
         if not known or record.answer == "failed":
             return QUICK
-        due = self._age_s(record.wall_ns) >= config.check_every_s or self._full_is_due()
+        both_s = self._cell.tool_worst_s(QUICK) + self._cell.tool_worst_s(FULL)
+        due = self._age_s(record.wall_ns) >= config.check_every_s
+        due = due or (self._full_is_due() and self._cell.fits(both_s))
         return QUICK if due else ""
 
     def _full_is_due(self) -> bool:
@@ -286,7 +288,8 @@ class ToolPart:
         )
         if full:
             memory.note_tool(full_ns=self.wall_ns)
-            if answer.done:
+            told = ToolError(memory.tool.drift_rms_m, memory.tool.drift_bound_m)
+            if answer.done or told == UNKNOWN:  # one that finds the same tool tells it too
                 drift = self._drift() or UNKNOWN
                 memory.note_tool(drift_rms_m=drift.rms_m, drift_bound_m=drift.bound_m)
         elif outcome.accepted and verdict == "recalibrate":

@@ -37,6 +37,8 @@ STOPS = ("MISMATCH", "OTHER_COMMANDER")  # the line stands, whatever is known of
 UNCORRECTED = ("OFF", "WITHOUT_MODEL")  # where the accuracy is not what it should be
 WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
 LASTING = (Code.WRONG_ROBOT, Code.STORAGE_FAILED)  # of a gap: another one ends so again
+# Of `correction.interface.uncorrected`: a newer model comes of a gap, and in one the robot stands.
+GAP_MENDS = ("corrects without the model", "waits until the robot stands")
 SILENT, FAULT = "SILENT", "FAULT"
 
 
@@ -210,7 +212,9 @@ class PanelState:
                 Instruction("state/HISTORY", Code.STORAGE_FAILED.name, self.history_trouble)
             )
         level = named(LEVELS, accuracy["state"])
-        if level == "DEGRADED" and accuracy["reason"].startswith("correction: "):
+        reason = accuracy["reason"]
+        mends = any(words in reason for words in GAP_MENDS)
+        if level == "DEGRADED" and reason.startswith("correction: ") and not mends:
             level = "UNCORRECTED"  # drift and tool are known well enough: no gap mends it
         if level != "OK" or not found:
             found.append(Instruction(f"state/{level}", detail=accuracy["reason"]))

@@ -482,6 +482,7 @@ class ServerThread:
         self._ending: asyncio.Event | None = None
         self._stopped = False
         self._tasks: set[asyncio.Future[Any]] = set()
+        self._expelling: asyncio.Future[None] | None = None
         self._latest: dict[str, tuple[Sequence[tuple[str, ua.Variant]], datetime, float]] = {}
         self._log = _Notices(hand)
         self._thread = threading.Thread(target=self._run, name="opc_ua", daemon=True)
@@ -594,7 +595,9 @@ class ServerThread:
         model = self.cell.model
         await model.look(time.monotonic())
         await model.set(ACTIVE, ua.Variant(self.cell.active))
-        await self._expel(server.iserver)
+        if self._expelling is None or self._expelling.done():  # a disk that hangs holds up nothing
+            self._expelling = asyncio.ensure_future(self._expel(server.iserver))
+            self._expelling.add_done_callback(self._ended)
         names = [s.label for s in server.iserver.sessions if s.is_activated()]
         self.state.sessions = tuple(sorted(names))
 
@@ -605,7 +608,7 @@ class ServerThread:
         if accounts is None:
             return
         for session, user in users:
-            if accounts.get(user.name) != user.account:
+            if session.user is user and accounts.get(user.name) != user.account:
                 words = "its user was taken out, or has another password or role"
                 self._hand(Notice(f"{session.label} is ended: {words}"))
                 await session.close_session()

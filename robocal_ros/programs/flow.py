@@ -3,7 +3,7 @@
 
 A text is gone through in its order. Behind a branch or a loop holds what all ways to there have;
 where they differ it is unknown, by a name that no frame has. A routine that is called sets what it
-sets in some way: unknown behind its call.
+sets in some way: unknown behind its call, but for what is in force there anyway.
 """
 
 import re
@@ -24,8 +24,9 @@ class FlowStep:
     """A place where what is in force may change.
 
     ``does``: "set" these ``names`` by kind; "begin" a block, or a "loop", whose further ways begin
-    at a "branch" or "else", up to its "end"; define a "routine", with what its callers have, or one
-    that stands "alone", of whose callers nothing is known; "call" one.
+    at a "branch" or "else", up to its "end"; "leave" the innermost loop, or go to its begin; define
+    a "routine", with what its callers have, or one that stands "alone", of whose callers nothing is
+    known; "call" one.
     """
 
     at: int
@@ -75,11 +76,11 @@ class _Known:
     """What one way through the text finds out for the next.
 
     ``starts``: by the step of a loop, in force where it begins. Of a routine: ``sets``, the kinds
-    that it sets; ``called``, what its callers have in force.
+    and frames that it sets; ``called``, what its callers have in force.
     """
 
     starts: dict[int, State] = field(default_factory=dict)
-    sets: dict[str, set[str]] = field(default_factory=dict)
+    sets: dict[str, set[tuple[str, str | None]]] = field(default_factory=dict)
     called: dict[str, State] = field(default_factory=dict)
 
 
@@ -115,10 +116,11 @@ class Flow:
             match step.does:
                 case "set":
                     state = {**state, **step.names}
-                    found.sets.setdefault(routine, set()).update(step.names)
+                    found.sets.setdefault(routine, set()).update(step.names.items())
                 case "call":
-                    kinds = known.sets.get(step.routine, set())
-                    found.sets.setdefault(routine, set()).update(kinds)
+                    sets = known.sets.get(step.routine, set())
+                    found.sets.setdefault(routine, set()).update(sets)
+                    kinds = {kind for kind, its in sets if not self._same(its, state.get(kind))}
                     others = found.called.get(step.routine, state)
                     met = self._met([others, state], self._defined[step.routine])
                     found.called[step.routine] = met
@@ -136,11 +138,17 @@ class Flow:
                     blocks[-1].ends.append(state)
                     blocks[-1].whole |= step.does == "else"
                     state = blocks[-1].before
+                case "leave":
+                    loops = [block for block in blocks if block.does == "loop"]
+                    if loops:
+                        loops[-1].ends.append(state)
                 case "end" if blocks:
                     block = blocks.pop()
                     if block.does == "loop":
                         begin = self._steps[block.begin].at
-                        found.starts[block.begin] = self._met([block.before, state], begin)
+                        found.starts[block.begin] = self._met(
+                            [block.before, *block.ends, state], begin
+                        )
                     if block.does == "routine":
                         state, routine = block.before, block.routine
                     else:

@@ -73,7 +73,7 @@ _SET = re.compile(
 )
 _BLOCK = re.compile(
     r"^[ \t]*(?:(?P<begin>IF|SWITCH)|(?P<loop>WHILE|FOR|LOOP|REPEAT)|(?P<branch>CASE|DEFAULT)"
-    r"|(?P<else>ELSE)|(?P<end>UNTIL|END(?:IF|SWITCH|WHILE|FOR|LOOP|FCT)?)"
+    r"|(?P<else>ELSE)|(?P<leave>EXIT)|(?P<end>UNTIL|END(?:IF|SWITCH|WHILE|FOR|LOOP|FCT)?)"
     r"|(?:GLOBAL[ \t]+)?DEF(?:FCT[ \t]+[\w\[\]]+)?[ \t]+(?P<alone>\w+))\b",
     re.I | re.M,
 )
@@ -342,7 +342,9 @@ def _framed(
         for one in within:
             if one.at <= at < one.until:
                 names |= one.names
-    if names.get("$IPO_MODE"):
+    if mode := names.get("$IPO_MODE"):
         words = "the robot carries the part to a tool that stands"
+        if mode != "#TCP":
+            words = f"whether the robot carries the part is not known ({mode})"
         return replace(point, problem=point.problem or words)
     return replace(point, tool=names.get("$TOOL"), frame=names.get("$BASE"))

@@ -41,7 +41,8 @@ SET_TCP = "set_tcp"
 
 _CALL = re.compile(rf"\b({'|'.join(TARGETS)}|{SET_TCP})\s*(?=\()")
 _BLOCK = re.compile(
-    r"\b(?:(?P<begin>if)|(?P<loop>while|for)|(?P<branch>elif)|(?P<else>else)|(?P<end>end)"
+    r"\b(?:(?P<begin>if)|(?P<loop>while|for)|(?P<branch>elif)|(?P<else>else)"
+    r"|(?P<leave>break|continue)|(?P<end>end)"
     r"|(?:def|thread|sec)\s+(?P<routine>\w+))\b"
 )
 _OWN_CALL = re.compile(r"\b(\w+)\s*\(")

@@ -253,5 +253,7 @@ def test_a_station_that_moved_degrades_until_a_check_passes(cell):
     assert result.accepted == ()
     for later_ns, said in ((0, AccuracyLevel.DEGRADED), (DAY_NS, AccuracyLevel.EXPIRED)):
         assert level(cell, later_ns) is said
-        assert words in cell.session.accuracy(cell.now_s, cell.wall_ns + later_ns).reason
+        found = cell.session.accuracy(cell.now_s, cell.wall_ns + later_ns)
+        assert words in found.reason
+        assert found.error is None
     a_check_passes(cell, "c2")

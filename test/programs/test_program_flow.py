@@ -70,6 +70,21 @@ def test_a_routine_does_not_have_the_frames_of_the_one_above():
     assert point.frame is None
 
 
+def test_a_routine_with_the_usual_begin_carries_no_part():
+    krl = (
+        "DEF A()\nBAS(#INITMOV,0)\nGRIP()\n$TOOL=TOOL_DATA[1]\n$BASE=BASE_DATA[1]\n"
+        f"LIN {POINT}\nTURN()\nLIN {POINT}\nEND\n"
+        "DEF GRIP()\nBAS(#INITMOV,0)\n$OUT[1]=TRUE\nEND\n"
+        "DEF TURN()\n$IPO_MODE=#TCP\nEND\n"
+    )
+    points = dialect_of(".src").read(krl).points
+    assert [(point.tool, point.frame) for point in points][:1] == [("TOOL_DATA[1]", "BASE_DATA[1]")]
+    assert [point.problem for point in points] == [
+        "",
+        "whether the robot carries the part is not known ($IPO_MODE of line 7 on)",
+    ]
+
+
 @pytest.mark.parametrize(
     ("lines", "bases"),
     [
@@ -83,10 +98,15 @@ def test_a_routine_does_not_have_the_frames_of_the_one_above():
         ([B1, "SWITCH K", "CASE 1", B2, "CASE 2", B2, "ENDSWITCH", LIN], ["$BASE of line 7 on"]),
         ([B1, "LOOP", LIN, B2, LIN, "ENDLOOP"], ["$BASE of line 2 on", "BASE_DATA[2]"]),
         (
+            [B1, "LOOP", B2, "IF K==1 THEN", "EXIT", "ENDIF", B1, "ENDLOOP", LIN],
+            ["$BASE of line 8 on"],
+        ),
+        (
             [B1, "FOR I=1 TO 2", LIN, "ENDFOR", "WAIT FOR $IN[1]", LIN],
             ["BASE_DATA[1]", "BASE_DATA[1]"],
         ),
         (["DEF A()", B1, "B()", LIN, "END", "DEF B()", B2, "END"], ["$BASE of line 3 on"]),
+        (["DEF A()", B2, "B()", LIN, "END", "DEF B()", B2, "END"], ["BASE_DATA[2]"]),
         (["DEF A()", B1, "B ( )", LIN, "END", "DEF B()", LIN, "END"], ["BASE_DATA[1]", None]),
     ],
 )
@@ -106,6 +126,8 @@ def test_the_base_of_krl_is_that_of_all_ways_to_a_point(lines, bases):
         ([A, "if x>1:", B, "else:", B, "end", MOVEL], ["3"]),
         ([A, "while True:", MOVEL, B, MOVEL, "end"], ["2 on", "4"]),
         ([A, "while True:", A, MOVEL, "end", MOVEL], ["3", "3"]),  # the same pose
+        ([A, "while True:", B, "if x>1:", "break", "end", A, "end", MOVEL], ["8 on"]),
+        ([A, "while x>1:", MOVEL, B, "if x>2:", "continue", "end", A, "end"], ["2 on"]),
         (["def Sub():", MOVEL, "end", A, "Sub()"], ["4"]),  # as its caller
         (["def Sub():", MOVEL, "end", A, "Sub()", B, "Sub()"], ["1 on"]),
     ],
