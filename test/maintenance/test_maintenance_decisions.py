@@ -153,6 +153,7 @@ def test_of_a_tool_that_was_measured_through_an_unknown_drift_no_error_is_predic
     """Also once the drift is known again; a cell without measuring poses asks for none."""
     unknown = replace(KNOWN, level=AccuracyLevel.EXPIRED, error=None)
     cell = opened(history, config=config_of(poses=poses), check=bent(), drift=unknown)
+    finds_the_same = cell.full
     number = measured_in_full(cell)
     cell.finish()
     decide(cell, ACCEPT, number)
@@ -160,6 +161,10 @@ def test_of_a_tool_that_was_measured_through_an_unknown_drift_no_error_is_predic
     cell.ran("c2")
     assert level(cell) is AccuracyLevel.OK
     assert (cell.session.accuracy(cell.now_s, cell.wall_ns).error is None) == bool(len(poses))
+    cell.check, cell.full = bent(), finds_the_same
+    cell.drift = replace(KNOWN, error=ToolError(1e-5, 1.5e-5))
+    assert cell.ran("c3").tool_code is Code.NO_SIGNIFICANT_GAIN
+    assert cell.session.accuracy(cell.now_s, cell.wall_ns).error is not None
 
 
 def test_what_a_person_chose_meanwhile_is_not_taken_back(history):

@@ -68,14 +68,16 @@ def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(
 
 
 def test_a_full_measurement_comes_when_it_is_due_though_no_check_is(history, monkeypatch):
+    """Where the gap has time for it: else each gap would check the tool, and leave the rest."""
     cell = opened(history, config=config_of(check_every_s=7200.0, full_every_s=3600.0))
     begun_ns, found = maintenance_cell.WALL_NS, []
-    for name, later_s in (("c1", 0), ("c2", 1800), ("c3", 4000)):
+    long_s, short_s = maintenance_cell.LONG_S, TOO_SHORT_FOR_FULL_S
+    for later_s, gap_s in ((0, long_s), (1800, long_s), (4000, short_s), (4000, long_s)):
         monkeypatch.setattr(maintenance_cell, "WALL_NS", begun_ns + later_s * 10**9)
         cell.log.clear()
-        assert cell.ran(name).complete
+        assert cell.ran(f"c{len(found)}", gap_s).complete
         found.append(modes(cell))
-    assert found == [["quick", "full"], [], ["quick", "full"]]
+    assert found == [["quick", "full"], [], [], ["quick", "full"]]
 
 
 def test_a_first_check_that_fails_leaves_the_tool_unknown(cell):
