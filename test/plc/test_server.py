@@ -212,6 +212,28 @@ def test_who_is_taken_out_or_has_another_role_loses_his_session(
     served.works()
 
 
+def test_a_disk_that_hangs_below_the_users_holds_up_nothing_else(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is silent is marked by the same loop that looks who may stay."""
+    asked, goes_on = threading.Event(), threading.Event()
+
+    def hangs(folder: Path) -> access.Users:
+        asked.set()
+        assert goes_on.wait(60.0)
+        return access.Users(folder)
+
+    monkeypatch.setattr(plc_server, "Users", hangs)
+    try:
+        assert asked.wait(30.0)
+        for active in (False, True):
+            served.thread.set_active(active)
+            _until(lambda active=active: served.plc.do(served.plc.read("Active")) is active)
+    finally:
+        goes_on.set()
+    served.works()
+
+
 def test_logins_are_looked_at_in_one_thread(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
