@@ -444,7 +444,7 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     if args.robot_serial is not None and len(q):
         with model_history(args, nominal) as history:
             in_force = shift_in_force(history, models, q, T_first)
-    kept = shift = _as_they_are(models, work) if in_force is None else in_force.shift
+    shift = kept = _as_they_are(models, work) if in_force is None else in_force.shift
     if not args.in_force:
         shift = best_shift(
             models,

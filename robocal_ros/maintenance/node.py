@@ -46,7 +46,7 @@ from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState
 from robocal_ros.motion.cell import load_motion
 from robocal_ros.motion.driver import LeaseHolder, MotionDriver, goal_tolerances, guarded
 from robocal_ros.motion.robot_watch import BEHIND_S, MotionReport
-from robocal_ros.motion.steady_clock import SteadyClock
+from robocal_ros.motion.stopping import SteadyClock
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, EndpointNode, Health, NotActiveError

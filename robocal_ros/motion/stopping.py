@@ -4,9 +4,11 @@
 A controller has no order to stop: it drives on where it is sent nothing or a trajectory without
 points, and the cancel of a goal is a dead stop from any speed. What stops it is a motion that
 decelerates from where it is. A message may be lost, and a goal may be rejected or taken over: where
-the robot stands is the only proof.
+the robot stands is the only proof, by a clock that nobody sets.
 """
 
+import time
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +26,37 @@ AGAIN_S = 0.02  # a stop that is rejected is not sent again sooner
 SHORTEST_AGAIN_S = 0.08  # of a stop that is sent again: time was lost
 MOST_SENT = 4  # what does not obey that many is stopped by other means
 GIVE_UP_S = 1.0  # after the planned end
+
+
+class SteadyClock:
+    """Seconds that no setting of the clock changes, those of a suspended host included.
+
+    What was heard before it was suspended is old when it wakes. A motion is not: the controller of
+    the same host stood still with it.
+
+    ``slept``: takes for how long the host was suspended, before a time of afterwards is given out.
+    """
+
+    def __init__(self, slept: Callable[[float], None]) -> None:
+        self._slept = slept
+        self._asleep_s = _both()[1]
+
+    def now_s(self) -> float:
+        """What it shows."""
+        now_s, asleep_s = _both()
+        if asleep_s > self._asleep_s:
+            for_s, self._asleep_s = asleep_s - self._asleep_s, asleep_s
+            self._slept(for_s)
+        return now_s
+
+
+def _both() -> tuple[float, float]:
+    """The time, and how much of it the host was asleep, at least.
+
+    The second clock is read later: what passes in between makes it less, never more.
+    """
+    now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return now_s, now_s - time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
 class StoppedRobot(Protocol):

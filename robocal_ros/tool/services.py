@@ -28,7 +28,7 @@ from robocal_ros.motion.driver import (
 )
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import BEHIND_S, Gap, MotionReport
-from robocal_ros.motion.steady_clock import SteadyClock
+from robocal_ros.motion.stopping import SteadyClock
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS, StaticTf, header, pose_message, transform_message
 from robocal_ros.ros.endpoints import NotActiveError

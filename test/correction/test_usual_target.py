@@ -180,11 +180,16 @@ def test_a_usual_target_comes_to_what_the_long_way_comes_to(
             q, speed = twin.lines[0].robot.at.copy(), np.zeros(6)
 
 
-def _follows(fill: Callable[[bytes, int], bytes]) -> list[bool]:
-    """Which of an even stream's targets are usual, each filled up by its number."""
+def _corrected() -> Line:
     line = Line(usual=True)
     line.session.offer_model(offer(drifted(1.0)))
     line.session.enable(True)
+    return line
+
+
+def _follows(fill: Callable[[bytes, int], bytes]) -> list[bool]:
+    """Which of an even stream's targets are usual, each filled up by its number."""
+    line = _corrected()
     for k in range(200):
         line.robot.now += DT
         line.robot.read(line.robot.at)
@@ -194,9 +199,7 @@ def _follows(fill: Callable[[bytes, int], bytes]) -> list[bool]:
 
 
 def test_two_targets_after_its_source_s_clock_was_set_ahead_they_are_usual_again() -> None:
-    line = Line(usual=True)
-    line.session.offer_model(offer(drifted(1.0)))
-    line.session.enable(True)
+    line = _corrected()
     for k in range(200):
         line.robot.now += DT
         line.robot.read(line.robot.at)

@@ -119,10 +119,14 @@ def test_a_stop_counts_beside_other_publishers(graph: Any) -> None:
     way = trajectory(np.stack([HOME, HOME + 0.9 * np.eye(6)[0]]), np.array([0.1, 9.0]))
     line.to_path.publish(way)
     line.wait(line.paths)
-    path, until_s = line.node._session.output.path, time.monotonic() + 0.5
-    while time.monotonic() < until_s:
+    path, robot = line.node._session.output.path, line.node._session.output.robot
+
+    def is_on_its_way() -> bool:
         line.to_states.publish(joints(path.place(time.monotonic())))
         graph.spin_for(0.02)
+        return bool(robot.measured[0] > HOME[0] + 0.05)
+
+    graph.spin_until(is_on_its_way, "it is seen on its way")
     supervisor.publish(JointTrajectory(joint_names=NAMES))
     stop = line.wait(line.paths, 2)
     assert stop.points[-1].positions[0] < HOME[0] + 0.5

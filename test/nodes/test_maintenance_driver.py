@@ -24,7 +24,7 @@ from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPIES, COPY_S, MotionDriver
 from robocal_ros.motion.plan import JointPlan, MotionLimits, stop
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
-from robocal_ros.motion.steady_clock import SteadyClock
+from robocal_ros.motion.stopping import SteadyClock
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.graph import actions_beside
 

@@ -4,6 +4,7 @@
 import json
 import math
 import tracemalloc
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -12,7 +13,9 @@ from panel_faults import SENDS_TO, heard, told, wrongly_told
 from panel_page import NOTHING, accuracy, ended, status
 
 from bench.closed_loop.faults import RIGHT
+from robocal_ros.correction.interface import CorrectionState, ToldCorrection, uncorrected
 from robocal_ros.ground.errors import Code
+from robocal_ros.history.history_records import THERMAL, TOOL, Head
 from robocal_ros.panel.state import (
     ACCURACY,
     BUCKET_S,
@@ -222,16 +225,18 @@ def test_of_a_correction_only_what_stops_or_what_it_spoils_is_told():
 
 def test_no_gap_is_asked_for_where_the_correction_alone_is_amiss():
     """As accuracy_of of maintenance has it: its reason names the parts at the worst level."""
-    old = "correction: joint_correction_node corrects with tool revision 2, in force is revision 3"
+    in_force = Head(THERMAL, 4, 17, {}), Head(TOOL, 3, 18, {})
+    on = ToldCorrection(state=CorrectionState.ON, enabled=True, model_revision=4, tool_revision=2)
+    old = f"correction: {uncorrected(on, *in_force)}"
     degraded = accuracy("DEGRADED", reason=old)
     assert keys(shown(**{ACCURACY: degraded})) == ["state/UNCORRECTED"]
     for state, first in (("ON", []), ("OFF", ["correction/OFF"])):
         told = {"state": CORRECTIONS.index(state), "reason": ""}
         panel = shown(**{CORRECTION: told, ACCURACY: degraded})
         assert keys(panel) == [*first, "state/UNCORRECTED"]
-    waits = f"{old}: that one waits until the robot stands or a trajectory begins"
-    stale = "correction: joint_correction_node corrects without the model, it is 9 s old: accept a"
-    for reason in (f"drift: below 0.4 mm; {old}", waits, stale):
+    waits = uncorrected(replace(on, waiting_tool_revision=3), *in_force)
+    stale = uncorrected(replace(on, stale="model revision 4 is 9 s old, allowed 8 s"), *in_force)
+    for reason in (f"drift: below 0.4 mm; {old}", f"correction: {waits}", f"correction: {stale}"):
         assert keys(shown(**{ACCURACY: accuracy("DEGRADED", reason=reason)})) == ["state/DEGRADED"]
 
 

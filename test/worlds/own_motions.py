@@ -29,7 +29,7 @@ from robocal_ros.motion.driver import (
 )
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import BEHIND_S, MotionReport
-from robocal_ros.motion.steady_clock import SteadyClock
+from robocal_ros.motion.stopping import SteadyClock
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import NS
