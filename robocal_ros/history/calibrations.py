@@ -34,6 +34,7 @@ from robocal_ros.history.history_file import (
     storage_errors,
 )
 from robocal_ros.history.history_records import (
+    FIXTURE,
     THERMAL,
     Action,
     CalibrationState,
@@ -257,6 +258,9 @@ _UNDECIDED = (
     "WHERE calibration_id = calibrations.id AND action <> 'rollback') ORDER BY id DESC LIMIT ?"
 )
 
+# "0" is what comes next after "/"
+_FIXTURES = "SELECT DISTINCT kind FROM calibrations WHERE kind > ? AND kind < ? ORDER BY kind"
+
 BUSY_TIMEOUT_S = 2.0
 """Longest wait for another process's change, itself a matter of milliseconds."""
 
@@ -414,6 +418,12 @@ class HistoryReader:
             revision, _ = self._ledger.head(kind)
             rows = read_candidates(connection, _UNDECIDED, kind, revision, Code.ACCEPT, limit)
             return tuple(self._entry(*row) for row in rows)
+
+    def fixtures(self) -> tuple[str, ...]:
+        """Kinds of the fixtures that were ever measured; see `fixture_kind`."""
+        with self._reading() as connection:
+            rows = connection.execute(_FIXTURES, (f"{FIXTURE}/", f"{FIXTURE}0"))
+            return tuple(kind for (kind,) in rows)
 
     def decisions(self, after_seq: int = 0, newest: int = -1) -> tuple[Decision, ...]:
         """Decisions of every kind after a sequence number, oldest first.

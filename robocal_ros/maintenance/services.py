@@ -94,6 +94,7 @@ class MaintenanceOutputs:
             disarmed=status.disarmed,
             thermal_pending=status.thermal_pending,
             tool_pending=status.tool_pending,
+            fixture_pending=status.fixture_pending,
             fault_code=int(status.fault_code),
             fault=status.fault,
             last=result_message(status.last),

@@ -230,9 +230,10 @@ class Status:
     at_home: bool
     disarmed: bool
     last: CycleResult | None  # how the last cycle ended; None before any
-    # thermal_pending, tool_pending: newest candidates that wait for a decision; 0: none
+    # ..._pending: newest candidates that wait for a decision, of any fixture; 0: none
     thermal_pending: int
     tool_pending: int
+    fixture_pending: int
     # fault_code, fault: NONE and empty without one
     fault_code: Code
     fault: str
@@ -482,10 +483,11 @@ class MaintenanceSession:
         cell, memory, running = self._cell, self.memory, self.running
         last = next(reversed(memory.cycles.values()), None)
         named = last.cycle_id if last is not None else ""
-        thermal, tool, trouble = 0, 0, ""
+        thermal, tool, fixture, trouble = 0, 0, 0, ""
         try:
             newest = [self._decider.newest(kind) for kind in (THERMAL, TOOL)]
-            thermal, tool = (found.id if found else 0 for found in newest)
+            newest.append(self._decider.newest_fixture())
+            thermal, tool, fixture = (found.id if found else 0 for found in newest)
         except RobocalError as error:
             trouble = str(error)
         return Status(
@@ -498,6 +500,7 @@ class MaintenanceSession:
             last=last,
             thermal_pending=thermal,
             tool_pending=tool,
+            fixture_pending=fixture,
             fault_code=memory.fault_code,
             fault=memory.fault,
             beat=cell.gap.beat,

@@ -25,6 +25,7 @@ from robocal_ros.panel.state import (
     CORRECTION,
     FIXTURE,
     LONGEST_TEXT,
+    PENDING,
     STATUS,
     plain,
 )
@@ -77,8 +78,8 @@ SOURCES: Mapping[str, tuple[type, str, Read]] = {
     STATUS: (
         MaintenanceStatus,
         "maintenance_node/status",
-        _of("state", "cycle_id", "doing", "left_s", "at_home", "thermal_pending", "tool_pending",
-            "fault_code", "fault") | {"last": lambda m: plain(m.last, LAST)},
+        _of("state", "cycle_id", "doing", "left_s", "at_home", "fault_code", "fault", *PENDING)
+        | {"last": lambda m: plain(m.last, LAST)},
     ),
     CORRECTION: (CorrectionStatus, "joint_correction_node/status", _of("state", "reason")),
     FIXTURE: (CalibrationQuality, FIXTURE, _of("code", "candidate_id", "reason")),

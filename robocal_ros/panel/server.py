@@ -247,9 +247,6 @@ class PanelServer:
         if found is not None:
             self._records, self._records_version = found, self._records_version + 1
             self.panel.in_force = frozenset(found["in_force"])
-            results = found["results"]
-            self.panel.pending = frozenset(r["id"] for r in results if r["state"] == "pending")
-            self.panel.newest = max((r["id"] for r in results), default=0)
             self.panel.history_trouble = found["trouble"]
             self._wake()
 

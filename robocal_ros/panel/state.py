@@ -32,6 +32,7 @@ MAINTENANCE = ("NONE", "IDLE", "RUNNING", "BREAKING_OFF", "FAULT")  # of Mainten
 CORRECTIONS = (
     "NONE", "OFF", "BLENDING", "ON", "WITHOUT_MODEL", "MISMATCH", "OTHER_COMMANDER", "LEASED",
 )  # fmt: skip
+PENDING = ("thermal_pending", "tool_pending", "fixture_pending")  # of MaintenanceStatus, too
 MOVES = ("RUNNING", "BREAKING_OFF")
 STOPS = ("MISMATCH", "OTHER_COMMANDER")  # the line stands, whatever is known of the accuracy
 UNCORRECTED = ("OFF", "WITHOUT_MODEL")  # where the accuracy is not what it should be
@@ -130,10 +131,7 @@ class PanelState:
         self.cycle_id = ""
         self.steps: deque[dict[str, Any]] = deque(maxlen=STEPS)
         self.gaps: deque[Values] = deque(maxlen=GAPS)
-        # calibrations, as the history says; of those that it lists, which are the newest ones
-        self.in_force: frozenset[int] = frozenset()
-        self.pending: frozenset[int] = frozenset()
-        self.newest = 0
+        self.in_force: frozenset[int] = frozenset()  # calibrations, as the history says
         self.history_trouble = ""
         self._found: dict[str, Values] = {}  # of drift and tool: the last gap that measured it
 
@@ -204,7 +202,8 @@ class PanelState:
                 found.append(_task(code, "gap", words))
             elif code not in WELL:
                 found.append(Instruction("state/BROKEN_OFF", code.name, words))
-        if status["thermal_pending"] or status["tool_pending"]:
+        told = self.sources[FIXTURE].values.get("candidate_id")  # it has an instruction of its own
+        if {status[name] for name in PENDING} - {0, told}:
             found.append(Instruction("state/DECIDE"))
         found += self._corrected(now_s)
         if self.history_trouble:
@@ -246,7 +245,7 @@ class PanelState:
             found.append(_task(Code.LIMIT_EXCEEDED, "gap", self.gaps[-1]["message"]))
         if fixture := self.sources[FIXTURE].values:
             code, number = code_of(fixture["code"]), fixture["candidate_id"]
-            waits = number in self.pending or number > self.newest
+            waits = number == self.sources[STATUS].values["fixture_pending"] != 0
             if code not in WELL or (code is Code.ACCEPT and waits):
                 found.append(_task(code, "fixture", fixture["reason"]))
         return found
@@ -299,7 +298,7 @@ class PanelState:
                 "maintenance": named(MAINTENANCE, status["state"]),
                 "doing": status["doing"],
                 "at_home": bool(status["at_home"]),
-                "waiting": [n for n in (status["thermal_pending"], status["tool_pending"]) if n],
+                "waiting": [n for n in (status[name] for name in PENDING) if n],
             }
         return shown
 

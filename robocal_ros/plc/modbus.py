@@ -79,6 +79,7 @@ INPUTS = (
     Register(52, "Tool.YMm", "f", "The same"),
     Register(54, "Tool.ZMm", "f", "The same"),
     Register(56, "Accuracy.ToleranceMm", "f", "The process allows, mm"),
+    Register(58, "Candidates.FixtureId", "I", "Fixture candidate that waits; 0: none"),
 )
 HOLDINGS = (
     Register(HEARTBEAT_AT, "Heartbeat", "I", "Beat while the robot may be moved, else 0"),
@@ -87,7 +88,7 @@ HOLDINGS = (
     Register(5, "Request.GapS", "H", "Length of the gap, s"),
     Register(6, "Request.Cycle", "I", "Number of the cycle; its id, not 0"),
 )
-INPUT_WORDS = 58
+INPUT_WORDS = 60
 
 
 class Image(Protocol):

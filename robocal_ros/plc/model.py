@@ -177,6 +177,7 @@ SHOWN = (
         (
             Item("ThermalId", "UInt32", "thermal_pending", "Newest thermal candidate"),
             Item("ToolId", "UInt32", "tool_pending", "Newest tool candidate"),
+            Item("FixtureId", "UInt32", "fixture_pending", "Newest fixture candidate"),
         ),
         SILENT_S,
     ),

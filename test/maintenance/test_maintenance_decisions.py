@@ -16,6 +16,7 @@ from maintenance_cell import (
     Cell,
     bent,
     config_of,
+    kept,
     kinds,
     opened,
     over,
@@ -35,7 +36,13 @@ from maintenance_tools import (
 
 from robocal_ros.ground.errors import Code, ConflictError, StorageError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import THERMAL, TOOL, Action
+from robocal_ros.history.history_records import (
+    THERMAL,
+    TOOL,
+    Action,
+    CalibrationState,
+    fixture_kind,
+)
 from robocal_ros.maintenance.deciding import HELD_S, Decider
 from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
@@ -360,6 +367,19 @@ def test_an_acceptance_without_an_id_is_repeated_for_a_minute(cell):
     for late_s in (61, -1):  # after a clock that was set back it is nobody's either
         with pytest.raises(ConflictError, match="one candidate must wait"):
             cell.session.decide_only(ACCEPT, "a person", cell.wall_ns + late_s * 10**9)
+
+
+def test_a_fixture_waits_until_it_is_decided(cell):
+    """Of several the newest; what is older than the one in force is outdated."""
+    history, fixtures = cell.history, (fixture_kind("plate"), fixture_kind("wheel"))
+    first, second, third = (kept(history, fixtures[n], {}) for n in (0, 1, 0))
+    assert history.fixtures() == fixtures
+    for number, name in ((third, ACCEPT), (second, REJECT)):
+        assert cell.session.status(cell.now_s).fixture_pending == number
+        decide(cell, name, number)
+    status = cell.session.status(cell.now_s)
+    assert (status.fixture_pending, status.thermal_pending, status.tool_pending) == (0, 0, 0)
+    assert history.get(first).state is CalibrationState.STALE
 
 
 def test_a_history_that_was_replaced_is_not_what_the_line_goes_by(history, tmp_path):

@@ -44,6 +44,7 @@ TRUE = {
     "LastCycle.Left": lambda s: list(s.last.left),
     "Candidates.ThermalId": lambda s: s.thermal_pending,
     "Candidates.ToolId": lambda s: s.tool_pending,
+    "Candidates.FixtureId": lambda s: s.fixture_pending,
 }
 
 

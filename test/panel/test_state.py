@@ -114,7 +114,7 @@ def by_whom(fault):
     if RIGHT[fault] is Code.SENSOR_OR_ROBOT_MOVED:
         return [as_drift]
     if fault == "fixture_moved":  # by fixture_node itself
-        return [status(last=ended())]
+        return [status(last=ended(), fixture_pending=9)]
     if fault == "frozen_encoder":  # tcf_node stops the robot, which left its plan: a FAULT
         both = ended(code=code, tool_code=code, tool_found_code=code)
         return [as_fault, status(**stopped, last=both)]
@@ -151,19 +151,24 @@ def verdict(code, candidate_id=0):
 
 
 def test_a_fixture_that_moved_is_told_until_a_person_has_decided():
-    panel = shown(**{FIXTURE: verdict(Code.ACCEPT, 9)})
+    waits = status(fixture_pending=9)
+    panel = shown(**{FIXTURE: verdict(Code.ACCEPT, 9), STATUS: waits})
     assert not wrongly_told("fixture_moved", panel, NOW_S)
+    assert keys(panel) == ["ACCEPT/fixture"]
     assert panel.tasks(NOW_S)[0].detail == "ACCEPT in words"
     later_s = NOW_S + 1e5  # it is said once, and stays; the others go on
+    heard(panel, {ACCURACY: accuracy(), STATUS: waits}, later_s)
+    assert not wrongly_told("fixture_moved", panel, later_s)
+    assert panel.document(later_s, 1e9)["waiting"] == [9]
     heard(panel, {ACCURACY: accuracy(), STATUS: status()}, later_s)
-    assert not wrongly_told("fixture_moved", panel, later_s)
-    panel.pending, panel.newest = frozenset({9}), 12
-    assert not wrongly_told("fixture_moved", panel, later_s)
-    panel.pending = frozenset()
     assert keys(panel, later_s) == ["state/OK"]
-    # Finding: when fifty newer results had taken its place in the list it was told anew.
-    panel.pending, panel.newest = frozenset({60}), 90
-    assert keys(panel, later_s) == ["state/OK"]
+
+
+def test_a_fixture_that_waits_since_before_the_panel_started_is_told_as_what_waits():
+    """Also where the verdict that is heard is of another one, measured meanwhile."""
+    assert keys(shown(**{STATUS: status(fixture_pending=9)})) == ["state/DECIDE"]
+    other = shown(**{FIXTURE: verdict(Code.NO_SIGNIFICANT_GAIN), STATUS: status(fixture_pending=9)})
+    assert keys(other) == ["state/DECIDE"]
 
 
 @pytest.mark.parametrize(

@@ -422,7 +422,8 @@ def kinds(cell: Cell) -> list[str]:
     return [type(request).__name__ for request in cell.log]
 
 
-def _kept(history: Any, kind: str, model: dict[str, Any]) -> int:
+def kept(history: Any, kind: str, model: dict[str, Any]) -> int:
+    """A candidate that may be accepted."""
     return history.propose(
         Proposal(
             kind=kind, model_hash=ARM.model_hash, based_on=history.head(kind).revision,
@@ -434,7 +435,7 @@ def _kept(history: Any, kind: str, model: dict[str, Any]) -> int:
 
 def thermal_proposed(history: Any, kelvin: float) -> int:
     """A thermal candidate: a robot with grown links."""
-    return _kept(history, THERMAL, model_document(warmed(ARM, kelvin)))
+    return kept(history, THERMAL, model_document(warmed(ARM, kelvin)))
 
 
 def proposed(
@@ -451,7 +452,7 @@ def proposed(
         thermal_revision = history.head(THERMAL).revision
     made = made_with(tool_config(CELL, **made_otherwise))
     model = {"thermal_revision": thermal_revision, "made_with": made, "cause": cause}
-    return _kept(history, TOOL, tool.document() | model)
+    return kept(history, TOOL, tool.document() | model)
 
 
 def new_tool(number: int) -> DriverAnswer:

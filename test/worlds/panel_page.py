@@ -22,7 +22,7 @@ from bench.live.opc_ua import free_port
 from robocal_ros.ground.errors import Code
 from robocal_ros.panel.server import PanelCall, PanelServer, PanelSettings, host_names
 from robocal_ros.panel.sessions import encryption
-from robocal_ros.panel.state import ACCURACY, LEVELS, MAINTENANCE, STATUS
+from robocal_ros.panel.state import ACCURACY, LEVELS, MAINTENANCE, PENDING, STATUS
 
 CHROMIUM = os.environ.get("ROBOCAL_CHROMIUM") or next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
@@ -54,9 +54,8 @@ def status(state: str = "IDLE", **changes: Any) -> dict[str, Any]:
     """What maintenance_node says of itself."""
     return {
         "state": MAINTENANCE.index(state), "cycle_id": "", "doing": "", "left_s": 0.0,
-        "at_home": True, "thermal_pending": 0, "tool_pending": 0, "fault_code": 0, "fault": "",
-        "last": NOTHING,
-    } | changes  # fmt: skip
+        "at_home": True, "fault_code": 0, "fault": "", "last": NOTHING,
+    } | dict.fromkeys(PENDING, 0) | changes  # fmt: skip
 
 
 class Cell:
