@@ -378,6 +378,8 @@ class RecorderNode(HouseNode):
         if recording is None:
             raise ConflictError("nothing is being recorded: there is nothing to complete")
         self._next()
+        if self._again_s is not None:  # it broke off
+            raise StorageError(self._fault)
         response.success = True
         response.message = trigger_text(0, Code.ACCEPT, f"{recording.folder} is complete")
         return response

@@ -169,7 +169,9 @@ def test_what_no_flush_brought_to_the_disk_counts_as_not_recorded(graph, monkeyp
         said(graph, publisher, String, f"{i}")
     graph.spin_until(lambda: node.health().values["/words recorded"] == 10, "all came")
     monkeypatch.setattr(BagWriter, "flush", full)
-    graph.call(Trigger, f"/{NODE}/split")
+    split = graph.call(Trigger, f"/{NODE}/split")
+    assert not split.success
+    assert "No space left on device" in split.message
     health = node.health()
     assert (health.level, health.values["messages not recorded"]) == (ERROR, 10)
     assert "10 messages since 20" in health.message
