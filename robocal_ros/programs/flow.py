@@ -24,34 +24,35 @@ class FlowStep:
     """A place where what is in force may change.
 
     ``does``: "set" these ``names`` by kind; "begin" a block, or a "loop", whose further ways begin
-    at a "branch" or "else", up to its "end"; "leave" the innermost loop, or go to its begin; define
-    a "routine", with what its callers have, or one that stands "alone", of whose callers nothing is
-    known; "call" one.
+    at a "branch" or "else", up to its "end"; "leave" the innermost loop, or go to its begin; "jump"
+    to a "label" of the same routine; define a "routine", with what its callers have, or one that
+    stands "alone", of whose callers nothing is known; "call" one. ``name``: the routine's or the
+    label's.
     """
 
     at: int
     does: str
     names: State = field(default_factory=dict)
-    routine: str = ""
+    name: str = ""
 
 
 def flow_steps(clean: str, blocks: re.Pattern[str], calls: re.Pattern[str]) -> list[FlowStep]:
-    """Blocks, routines and their calls; ``blocks``: its groups are named as `FlowStep.does`.
+    """Blocks, jumps, routines and their calls; ``blocks``: its groups are named as `FlowStep.does`.
 
     Of ``calls`` the first group is the routine's name; routines of other texts are left out.
     """
     steps, routines = [], dict[int, str]()
     for found in blocks.finditer(clean):
         does = str(found.lastgroup)
-        name = found[does].lower() if does in ("routine", "alone") else ""
-        if name:
+        name = found[does].lower()
+        if does in ("routine", "alone"):
             routines[found.start(does)] = name
-        steps.append(FlowStep(found.start(), does, routine=name))
+        steps.append(FlowStep(found.start(), does, name=name))
     known = set(routines.values())
     for found in calls.finditer(clean):
         name, at = found[1].lower(), found.start(1)
         if name in known and at not in routines:
-            steps.append(FlowStep(at, "call", routine=name))
+            steps.append(FlowStep(at, "call", name=name))
     return steps
 
 
@@ -75,11 +76,13 @@ class _Block:
 class _Known:
     """What one way through the text finds out for the next.
 
-    ``starts``: by the step of a loop, in force where it begins. Of a routine: ``sets``, the kinds
-    and frames that it sets; ``called``, what its callers have in force.
+    ``starts``: by the step of a loop, in force where it begins; ``jumps``: by routine and label,
+    where each jump to it is. Of a routine: ``sets``, the kinds and frames that it sets; ``called``,
+    what its callers have in force.
     """
 
     starts: dict[int, State] = field(default_factory=dict)
+    jumps: dict[tuple[str, str], list[State]] = field(default_factory=dict)
     sets: dict[str, set[tuple[str, str | None]]] = field(default_factory=dict)
     called: dict[str, State] = field(default_factory=dict)
 
@@ -93,7 +96,7 @@ class Flow:
         self._places = [step.at for step in self._steps]
         self._states: list[State] = []
         routines = [step for step in self._steps if step.does in ("routine", "alone")]
-        self._defined = {step.routine: step.at for step in routines}
+        self._defined = {step.name: step.at for step in routines}
         callers: dict[str, State] = {}
         for _ in range(len(routines) + 1):  # what one is called with may hang on its own caller's
             known = _Known()
@@ -118,19 +121,19 @@ class Flow:
                     state = {**state, **step.names}
                     found.sets.setdefault(routine, set()).update(step.names.items())
                 case "call":
-                    sets = known.sets.get(step.routine, set())
+                    sets = known.sets.get(step.name, set())
                     found.sets.setdefault(routine, set()).update(sets)
                     kinds = {kind for kind, its in sets if not self._same(its, state.get(kind))}
-                    others = found.called.get(step.routine, state)
-                    met = self._met([others, state], self._defined[step.routine])
-                    found.called[step.routine] = met
+                    others = found.called.get(step.name, state)
+                    met = self._met([others, state], self._defined[step.name])
+                    found.called[step.name] = met
                     state = {**state, **{kind: self._unknown(kind, step.at) for kind in kinds}}
                 case "alone":
-                    state, routine = {}, step.routine
+                    state, routine = {}, step.name
                     blocks.clear()
                 case "routine":
                     blocks.append(_Block(i, step.does, state, routine))
-                    state, routine = callers.get(step.routine, state), step.routine
+                    state, routine = callers.get(step.name, state), step.name
                 case "begin" | "loop":
                     state = self._met([state, known.starts.get(i, state)], step.at)
                     blocks.append(_Block(i, step.does, state, routine))
@@ -142,6 +145,11 @@ class Flow:
                     loops = [block for block in blocks if block.does == "loop"]
                     if loops:
                         loops[-1].ends.append(state)
+                case "jump":
+                    found.jumps.setdefault((routine, step.name), []).append(state)
+                case "label":
+                    jumps = known.jumps.get((routine, step.name), [])
+                    state = self._met([state, *jumps], step.at)
                 case "end" if blocks:
                     block = blocks.pop()
                     if block.does == "loop":

@@ -63,7 +63,11 @@ _HERE = re.compile(rf"\bHERE[ \t]+({_NAME})", re.I)
 _BLOCK = re.compile(
     r"^(?:\.PROGRAM[ \t]+(?P<alone>[\w.]+)|[ \t]*(?:(?P<begin>IF\b(?=[^\r\n]*\bTHEN\b)|S?CASE)"
     r"|(?P<loop>WHILE|FOR|DO)|(?P<branch>ELSEIF|S?VALUE|ANY)|(?P<else>ELSE)|(?P<end>END|UNTIL))"
-    r"\b(?![ \t]*[=\[]))",
+    r"\b(?![ \t]*[=\[]))|\bGOTO[ \t]+(?P<jump>\w+)",
+    re.M | re.I,
+)
+_LABEL = re.compile(
+    r"^[ \t]*(\d+(?=[ \t]+[A-Z]|[ \t]*:)|(?!(?:ANY|ELSE)\b)[A-Z]\w*(?=[ \t]*:))[ \t]*:?",
     re.M | re.I,
 )
 _CALL = re.compile(r"\bCALL[ \t]+([\w.]+)", re.I)
@@ -90,6 +94,11 @@ class KawasakiDialect(Dialect):
     def read(self, text: str) -> Program:
         """Locations that motions go to, and taught steps; of a file without programs all."""
         clean = masked(text, ";")
+        labels = [
+            FlowStep(found.start(), "label", name=found[1].lower())
+            for found in _LABEL.finditer(clean)
+        ]
+        clean = _LABEL.sub(lambda found: " " * len(found[0]), clean)
         headers = [*_HEADER.finditer(clean)]
         ends = [*(found.start() for found in headers), len(clean)][1:]
         sections = [(found[1], found.end(), end) for found, end in zip(headers, ends, strict=True)]
@@ -118,7 +127,7 @@ class KawasakiDialect(Dialect):
         uses = {name: _Use() for name in values}
         points: list[ProgramPoint] = []
         computed: list[tuple[int, str]] = []
-        steps = flow_steps(clean, _BLOCK, _CALL)
+        steps = labels + flow_steps(clean, _BLOCK, _CALL)
         for span in programs:
             steps += _set_up(text, clean, span, constants, frames)
         flow = Flow(text, steps, frames)

@@ -74,7 +74,8 @@ _SET = re.compile(
 _BLOCK = re.compile(
     r"^[ \t]*(?:(?P<begin>IF|SWITCH)|(?P<loop>WHILE|FOR|LOOP|REPEAT)|(?P<branch>CASE|DEFAULT)"
     r"|(?P<else>ELSE)|(?P<leave>EXIT)|(?P<end>UNTIL|END(?:IF|SWITCH|WHILE|FOR|LOOP|FCT)?)"
-    r"|(?:GLOBAL[ \t]+)?DEF(?:FCT[ \t]+[\w\[\]]+)?[ \t]+(?P<alone>\w+))\b",
+    r"|(?:GLOBAL[ \t]+)?DEF(?:FCT[ \t]+[\w\[\]]+)?[ \t]+(?P<alone>\w+)|GOTO[ \t]+(?P<jump>\w+)"
+    r"|(?P<label>[A-Z]\w*)(?=[ \t]*:))\b",
     re.I | re.M,
 )
 _CALL = re.compile(r"\b(\w+)[ \t]*\(")
