@@ -310,9 +310,9 @@ class HistoryReader:
         ``serial``: robot serial; any text. ``model_hash``: hash of the nominal model in use; what
         was made for another one is refused. ``state_dir``: folder of the histories, default
         `state_folder()`. ``create``: False refuses a robot that has no history. ``busy_timeout_s``:
-        longest wait for other processes. ``sole_user``: the part that only one process may play for
-        this robot; empty: none. ``owner``: sets a damaged file aside and begins anew; others are
-        refused.
+        longest wait for changes by other processes. ``sole_user``: the part that only one process
+        may play for this robot; empty: none. ``owner``: sets a damaged file aside and begins anew;
+        others are refused.
 
         Raises `InputError`: bad serial, or no history and ``create`` is False; `WrongRobotError`:
         the file belongs to another serial; `StorageError`: the file cannot be opened, was made by a

@@ -196,6 +196,7 @@ def _acknowledged(history: Path) -> dict[str, Any]:
 # ---- the SQLite file behind a calibration history: place, schema, locks, damage -----------------
 
 
+MAKING_S = 15.0  # a new file is brought to the disk, which may be slow and busy
 _FULL_CHECK_BYTES = 2_000_000
 _NOT_READABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _ADVICE = {
@@ -258,18 +259,31 @@ class HistoryFile:
         self.connection: sqlite3.Connection
 
     def open(self, verify: Verify) -> None:
-        """Open, migrate and check the file; set it aside and begin anew when it is damaged."""
-        deadline = time.monotonic() + self._timeout_s
-        while not self._open_shared(verify):
-            if self._lock_now(fcntl.LOCK_EX):
+        """Open, migrate and check the file; set it aside and begin anew when it is damaged.
+
+        It stays locked against being set aside. Of several that begin at once one makes it.
+        """
+        waits_for, since_s = "", 0.0
+        while True:
+            if not self._lock_now(fcntl.LOCK_SH):
+                most_s = MAKING_S
+                why = f"another process has been making it, or setting it aside, for {MAKING_S:g} s"
+            elif self._sound(verify):
+                break
+            elif self._lock_now(fcntl.LOCK_EX):
                 self._renew(verify)
-            elif time.monotonic() > deadline:
-                raise StorageError(
-                    f"{self.path}: is missing or damaged while another process has it open; "
-                    "stop the nodes that use it, then start again"
-                )
+                continue
             else:
-                time.sleep(0.005)
+                most_s = self._timeout_s
+                why = (
+                    "is missing or damaged while another process has it open; stop the nodes that "
+                    "use it, then start again"
+                )
+            if why != waits_for:
+                waits_for, since_s = why, time.monotonic()
+            elif time.monotonic() - since_s > most_s:
+                raise StorageError(f"{self.path}: {why}")
+            time.sleep(0.005)
         state = self.path.stat()
         self._identity = (state.st_dev, state.st_ino)
 
@@ -305,9 +319,9 @@ class HistoryFile:
             return False
         return True
 
-    def _open_shared(self, verify: Verify) -> bool:
-        """Open a file that is there and sound; stays locked against being set aside."""
-        if not self.path.exists() or not self._lock_now(fcntl.LOCK_SH):
+    def _sound(self, verify: Verify) -> bool:
+        """Open a file that is there and sound."""
+        if not self.path.exists():
             return False
         try:
             self._connect(verify)

@@ -2,10 +2,12 @@
 """A history belongs to one robot and lies in one place; many processes share it."""
 
 import contextlib
+import fcntl
 import os
 import sqlite3
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from history_workers import SERIAL, proposal
 from long_form import amount
 
 from robocal_ros.ground.errors import InputError, StorageError, WrongRobotError
+from robocal_ros.history import history_file
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import history_path, known_serials, state_folder
 
@@ -141,6 +144,23 @@ class TestManyProcesses:
             with CalibrationHistory.open(f"new {number}", state_dir=tmp_path) as history:
                 assert len(history.list()) == 6
                 assert history.damaged is None
+
+    def test_who_opens_waits_for_who_makes_it(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Longer than for a change: a new file takes a slow disk seconds."""
+        CalibrationHistory.open("slow", state_dir=tmp_path).close()
+        lock = os.open(tmp_path / "slow.sqlite.lock", os.O_RDWR)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        threading.Timer(0.5, os.close, [lock]).start()  # which lets go of it
+        with CalibrationHistory.open("slow", state_dir=tmp_path, busy_timeout_s=0.05) as history:
+            assert history.damaged is None
+            lock = os.open(tmp_path / "never.sqlite.lock", os.O_RDWR | os.O_CREAT)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            monkeypatch.setattr(history_file, "MAKING_S", 0.05)
+            with pytest.raises(StorageError, match=r"making it, or setting it aside, for 0\.05 s"):
+                CalibrationHistory.open("never", state_dir=tmp_path)
+            os.close(lock)
 
     def test_data_version_tells_of_changes_by_anyone(self, history: CalibrationHistory) -> None:
         before = history.data_version()
