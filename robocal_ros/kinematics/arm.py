@@ -427,11 +427,15 @@ _POSES = 2000  # over the joints' range, among which the largest shift is sought
 
 
 def random_postures(arm: SerialArm, count: int = 60) -> Array:
-    """The same postures (count, n) at every call, throughout the joint limits."""
+    """The same postures (count, n) at every call, throughout the joint limits.
+
+    Where a limit is not known, half a turn or half a metre takes its place: from zero, or from the
+    other limit where that is farther out.
+    """
     rng = np.random.default_rng(0)
     span = np.where(arm.prismatic, 0.5, np.pi)
-    lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
-    upper = np.where(np.isfinite(arm.upper), arm.upper, span)
+    lower = np.where(np.isfinite(arm.lower), arm.lower, np.minimum(-span, arm.upper - span))
+    upper = np.where(np.isfinite(arm.upper), arm.upper, np.maximum(span, arm.lower + span))
     return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
 
 

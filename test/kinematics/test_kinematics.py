@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import ParameterSet, SerialArm, kernels
-from robocal_ros.kinematics.arm import ALPHA, BETA
+from robocal_ros.kinematics.arm import ALPHA, BETA, random_postures
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.universal_robots import (
     factory_arm,
@@ -200,6 +200,13 @@ def test_a_model_cannot_be_changed_in_place():
 def test_wrong_models_are_refused(wrong):
     with pytest.raises(ValueError, match=r"sign \+1 or -1|has shape"):
         replace(load_robot("ur10"), **wrong)
+
+
+def test_postures_lie_within_a_limit_whose_other_side_is_open():
+    lower, upper = np.array([0.6, 4.0, -np.inf]), np.array([np.inf, np.inf, -0.6])  # m, rad, m
+    q = random_postures(replace(load_robot("p1r2p3"), lower=lower, upper=upper))
+    assert np.all((lower <= q) & (q <= upper))
+    np.testing.assert_array_less([0.4, 2.5, 0.4], np.ptp(q, axis=0))
 
 
 # ---- Identity of a model -------------------------------------------------------------------------
