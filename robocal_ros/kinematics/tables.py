@@ -228,12 +228,17 @@ def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> TableLayout
 
     Raises `InputError` for an unknown, missing, doubled or nameless column, and for mixed units.
     """
-    names = _names(header, file)
-    _check_known(names, (*_of_joints(arm), *_POSES, *NUMBERS, *WORDS), file, arm)
-    place = {name: i for i, name in enumerate(names)}
+    place = _measured_places(header, arm, file)
     joints, factors = _joint_columns(place, arm, file)
     position, factor = _position_columns(place, file)
     return TableLayout(place, joints, factors, position, factor, orientation_columns(place, file))
+
+
+def _measured_places(header: Sequence[str], arm: SerialArm, file: str) -> Mapping[str, int]:
+    """Index of each column of a measurement table."""
+    names = _names(header, file)
+    _check_known(names, (*_of_joints(arm), *_POSES, *NUMBERS, *WORDS), file, arm)
+    return {name: i for i, name in enumerate(names)}
 
 
 def read_joint_columns(
@@ -490,12 +495,17 @@ def joint_texts(q: Array, arm: SerialArm) -> dict[str, list[str]]:
 
 
 def read_joints(path: Path, arm: SerialArm) -> Array:
-    """Joints (m, n) of a table of poses, measured or not."""
-    units = ["mm" if slides else "deg" for slides in arm.prismatic]
-    columns = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
-    others = (*WORDS, *NUMBERS, *POSITION["mm"], *QUATERNION)
-    table = read_cells(path, lambda header, file: check_plain(header, file, columns, others))
-    factors = [LENGTH_UNITS["mm"] if slides else ANGLE_UNITS["deg"] for slides in arm.prismatic]
+    """Joints (m, n) of a table of poses, measured or not: a measurement table, or its joints alone.
+
+    Raises `InputError` as `read_measurements`, of the header and the joints.
+    """
+    found: list[tuple[tuple[str, ...], Array]] = []
+
+    def check(header: list[str], file: str) -> None:
+        found.append(_joint_columns(_measured_places(header, arm, file), arm, file))
+
+    table = read_cells(path, check)
+    columns, factors = found[0]
     return np.column_stack([table.numbers(name) for name in columns]) * factors
 
 

@@ -13,7 +13,12 @@ from scipy.spatial.transform import Rotation
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.tables import beyond_limits, read_measurements, write_measurements
+from robocal_ros.kinematics.tables import (
+    beyond_limits,
+    read_joints,
+    read_measurements,
+    write_measurements,
+)
 
 
 def make_arm(prismatic: tuple[bool, ...]) -> SerialArm:
@@ -93,6 +98,24 @@ def test_three_ways_to_give_the_same_orientation(tmp_path: Path) -> None:
         data = read(tmp_path, f"q1_deg,q2_deg,x_mm,y_mm,z_mm,{columns}\n0,0,0,0,0,{cells}\n")
         assert data.rotation is not None
         np.testing.assert_allclose(data.rotation[0], turn.as_matrix(), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "q2_rad,q1_m,q3_m\n0.25,0.125,0.5\n",
+        "q1_mm,q2_rad,q3_mm,x_m,y_m,z_m,rx_deg,ry_deg,rz_deg\n125,0.25,500,1,2,3,0,0,0\n",
+        "sample,q1_mm,q2_rad,q3_mm,x_m,y_m,z_m,w_deg,p_deg,r_deg\na,125,0.25,500,,,,,,\n",
+    ],
+    ids=["joints alone", "a pose in metres", "a plan that waits for its poses"],
+)
+def test_joints_are_read_from_every_measurement_table(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    np.testing.assert_allclose(read_joints(path, MIXED), [[0.125, 0.25, 0.5]], rtol=1e-15)
+    path.write_text(text.replace("q2_rad", "q2_mm"))
+    with pytest.raises(InputError, match="its column is q2_deg or q2_rad"):
+        read_joints(path, MIXED)
 
 
 @pytest.mark.parametrize(
