@@ -185,7 +185,8 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
     q = functions.first + functions.step * steps
     delta, slope = functions.delta(q), functions.slope(q)
     kept = functions.identified_from is not None
-    known = known_model(arm) if kept or args.data is not None else None
+    asked = args.data is not None or args.figures is not None  # refused where nothing tells it
+    known = known_model(arm) if kept or asked else None
     sigma = np.full(q.shape, np.nan) if known is None else known.function_sigma(q)
     joints: list[Any] = []  # names of fields have the joint's unit
     rows = ["joint,q,q_unit,delta,delta_unit,slope,sigma"]

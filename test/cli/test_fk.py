@@ -201,6 +201,18 @@ def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "what joints turn besides what is read" in capsys.readouterr().out
 
 
+def test_bands_of_joint_functions_that_nobody_knows_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, drawn = tmp_path / "full.yaml", tmp_path / "drawn"
+    save_robot(with_joint_errors(load_robot("ur10"), 2), path)
+    command = ["joint-functions", "--robot", str(path), "--figures", str(drawn)]
+    status, document = answer(command, capsys)
+    assert status == 2
+    assert "does not say what it was identified from" in document["error"]["message"]
+    assert not drawn.exists()
+
+
 def test_joint_functions_have_the_unit_of_their_joint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
