@@ -464,8 +464,12 @@ def _functions(top: Fields, joints: Sequence["_Joint"]) -> JointFunctions:
     names = [joint.name for joint in joints]
     first, step, compliance = np.zeros(len(names)), np.ones(len(names)), np.zeros(len(names))
     tables: list[list[float]] = [[] for _ in names]
+    found: set[int] = set()
     for fields in top.items("functions", "joint function"):
         i = names.index(fields.choice("name", names))
+        if i in found:
+            fields.fail(f"is {quoted(names[i])}, which has a function already", "name")
+        found.add(i)
         keys = _FUNCTION_KEYS[joints[i].prismatic]
         _, unit = UNITS[joints[i].prismatic]
         fields.only("name", *keys)

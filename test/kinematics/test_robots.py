@@ -258,6 +258,13 @@ functions:
 """
 
 
+def test_two_functions_of_one_joint_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD + LAYER + "  - {name: one, compliance_urad_nm: 2}\n")
+    words = "joint function 2, name is 'one', which has a function already"
+    with pytest.raises(InputError, match=words):
+        load_robot(path)
+
+
 def test_a_joint_that_is_not_named_has_no_function(tmp_path: Path) -> None:
     arm = load_robot(write(tmp_path, GOOD + LAYER))
     at = np.array([[np.radians(2.5), 0.1]])
