@@ -609,11 +609,11 @@ def run_iso9283(args: argparse.Namespace) -> CliResult:
     commanded = _by_target(args.commanded, list(table), str(args.data))
     targets: dict[str, PoseAccuracyDocument] = {}
     warnings: list[str] = []
-    if EVERY in commanded and len(table) > 1:
+    without = [name for name in table if name not in commanded]
+    if EVERY in commanded and len(without) > 1:
         warnings.append(
-            "one commanded position is taken for the targets "
-            f"{', '.join(name for name in table if name not in commanded)}: give each its own "
-            "with --commanded TARGET=X,Y,Z"
+            f"one commanded position is taken for the targets {', '.join(without)}: give each its "
+            "own with --commanded TARGET=X,Y,Z"
         )
     for name, position in table.items():
         where = commanded.get(name, commanded.get(EVERY))

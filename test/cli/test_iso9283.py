@@ -80,6 +80,16 @@ class TestSeveralTargets:
         assert document["targets"]["p2"]["AP_mm"] == pytest.approx(1.0)
         assert any("taken for the targets p1, p2" in words for words in document["warnings"])
 
+    @pytest.mark.parametrize("own", [("p1=1,0,0",), ("p1=1,0,0", "p2=2,0,0")])
+    def test_where_at_most_one_takes_the_plain_one_nothing_is_said(
+        self, measure, own: tuple[str, ...]
+    ) -> None:
+        arguments = [word for value in ("2,0,0", *own) for word in ("--commanded", value)]
+        _, document = measure(list(self.LINES), *arguments)
+        errors = [found["AP_mm"] for found in document["targets"].values()]
+        assert errors == pytest.approx([0.0, 0.0], abs=1e-9)
+        assert not any("taken for" in words for words in document["warnings"])
+
     def test_one_with_a_single_row_is_refused_by_name(self, measure) -> None:
         status, document = measure([*self.LINES, "lonely,1,2,3"])
         assert status == 3
