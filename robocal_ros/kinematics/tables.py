@@ -115,7 +115,7 @@ def read_cells(path: Path, check: Callable[[list[str], str], None], separator: s
         header = next(reader)
         check(header, file)
         for number, row in enumerate(reader, start=2):
-            if row:
+            if len(row) > 1 or "".join(row).strip():  # no blank line
                 rows.append(row)
                 numbers.append(number)
     except csv.Error as error:

@@ -124,11 +124,12 @@ def test_joints_are_read_from_every_measurement_table(tmp_path: Path, text: str)
         "\ufeff" + GOOD,
         GOOD.replace("\n", "\r\n"),
         GOOD.replace("\n", "\n\n"),
+        GOOD.replace("\n", "\n \t\n"),
         GOOD.replace(",", " , "),
         GOOD.removesuffix("\n"),
         GOOD.replace("90", '"90"'),
     ],
-    ids=["BOM", "CRLF", "blank lines", "spaces", "no last newline", "quoted"],
+    ids=["BOM", "CRLF", "empty lines", "lines of blanks", "spaces", "no last newline", "quoted"],
 )
 def test_what_spreadsheets_write_is_read(tmp_path: Path, text: str) -> None:
     data = read(tmp_path, text)
