@@ -254,8 +254,8 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
         "--model",
         choices=("full", "geometric"),
         default="full",
-        help="full (default): geometry, a function of each joint's own angle, and compliances "
-        "where the robot file has a load, each only if the data want it; geometric: geometry alone",
+        help="full (default): geometry, a function of each joint's own angle, and compliances, "
+        "each only if the data want it; geometric: geometry alone",
     )
     parser.add_argument(
         "--figures",
