@@ -347,6 +347,7 @@ class CellSimNode(HouseNode):
         if settings["run_program"]:
             self.add_input(ToolStep, "next_step", self._await_step, endpoints.LATCHED)
         self._refused = ""
+        self._fault: tuple[str, float] = ("none", 0.0)
         self.add_timer(TICK_S, self._tick, steady=True)
 
     def activate(self) -> None:
@@ -354,7 +355,6 @@ class CellSimNode(HouseNode):
         self._origin_ns = None
         self._step: PlannedStep | None = None
         self._driven: tuple[int, int] | None = None
-        self._fault: tuple[str, float] = ("none", 0.0)
         self._out.forget()
         self._out.describe()
         self.settings_changed()

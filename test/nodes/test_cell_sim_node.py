@@ -342,6 +342,22 @@ def test_the_cell_goes_on_after_a_pause(graph):
     assert np.ptp(q[seen + 1 :], axis=0).max() < 1e-12  # it stopped
 
 
+def test_what_is_live_may_change_before_the_cell_lives_and_while_it_pauses(graph):
+    node = graph.add(CellSimNode, EXACT | {"autostart": False})
+    assert node.trigger_configure().name == "SUCCESS"
+    cell = node._cell
+    for fault in ("collision", "none", "protective_stop"):
+        (found,) = node.set_parameters([Parameter("fault", value=fault)])
+        assert found.successful
+        assert node.trigger_activate().name == "SUCCESS"
+        assert [*cell.faults.sizes] == [fault] * (fault != "none")
+        begun_s, now_s = cell.gate._since_s, cell.now_s
+        graph.spin_until(lambda at_s=now_s: cell.now_s > at_s + 0.1, "time passes")
+        assert node.trigger_deactivate().name == "SUCCESS"
+    assert node.trigger_activate().name == "SUCCESS"
+    assert cell.gate._since_s == begun_s  # the stop goes on, and does not begin anew
+
+
 def test_joints_that_do_not_fit_the_robot_are_refused(graph):
     node = graph.add(CellSimNode, {"q_start_deg": [0.0, 1.0]})
     assert node.state == "unconfigured"
