@@ -401,6 +401,7 @@ class SimulatedCell:
 
     def hold(self) -> None:
         """Stand still at once: the controller is inactive."""
+        self.gate.drop_late()
         self.motion.hold(self.now_s)
 
     def drive(self, step: PlannedStep) -> Circle | Plunge:

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 from robocal_ros.cell_sim.beams import COUNT_RAD, BeamStation, RoundTool, bent
 from robocal_ros.cell_sim.robot import Draws, Stream
-from robocal_ros.cell_sim.trajectory_controller import JointMotion, Trajectory, TrajectoryGoal
+from robocal_ros.cell_sim.trajectory_controller import (
+    GoalCode,
+    GoalState,
+    JointMotion,
+    Trajectory,
+    TrajectoryGoal,
+)
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
@@ -319,6 +325,12 @@ class CommandGate:
             self._motion.take(now_s, given)
             self._begun()
 
+    def drop_late(self) -> None:
+        """Drop what waits: a controller that is inactive takes nothing."""
+        for _, given in self._late:
+            _drop(given, "the controller is inactive")
+        self._late.clear()
+
     def pass_time(self, now_s: float, to_s: float) -> float:
         """Pass on what has waited until now, set the speed; up to when nothing changes."""
         for due_s, given in [waiting for waiting in self._late if waiting[0] <= now_s]:
@@ -326,8 +338,8 @@ class CommandGate:
             try:
                 self._motion.take(now_s, given)
                 self._begun()
-            except InputError:
-                pass  # ended in the past by now: dropped, as a controller drops it
+            except InputError as error:  # ended in the past by now
+                _drop(given, str(error))
         scale, stop_s = self.scale, self._faults.size("protective_stop")
         if "speed_scaling" in self._faults:
             scale *= self._faults.size("speed_scaling")
@@ -347,6 +359,12 @@ class CommandGate:
             self._lost += 1
             return True
         return False
+
+
+def _drop(given: Trajectory | TrajectoryGoal, why: str) -> None:
+    """It never takes effect; who sent a goal is told so."""
+    if isinstance(given, TrajectoryGoal):
+        given.end(GoalState.ABORTED, GoalCode.INVALID_GOAL, why)
 
 
 PAGE = 128  # readings whose random numbers belong together

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated controller and its drives, against interpolation written out here; its faults."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cell_plans import Q_START, plan_of
@@ -269,6 +271,27 @@ def test_a_late_command_takes_effect_later():
     cell.advance(0.7)
     assert cell.motion.at([cell.now_s])[0][0, 0] > Q_START[0] + 0.35
     assert at_end(cell) == pytest.approx(Q_START, abs=1e-12)
+
+
+def test_a_late_goal_that_is_over_by_then_is_aborted():
+    cell, first = moving("commands_late", 200.0, goal=True)
+    goal = TrajectoryGoal(replace(to(Q_START, 0.1), start_s=cell.now_s))
+    cell.gate.take(goal, cell.now_s)
+    assert at_end(cell) == pytest.approx(FAR, abs=1e-12)
+    assert (goal.state, goal.code) == (GoalState.ABORTED, GoalCode.INVALID_GOAL)
+    assert "in the past" in goal.text
+    assert first.state is GoalState.SUCCEEDED
+
+
+def test_what_is_late_when_the_controller_is_deactivated_never_takes_effect():
+    cell, _ = moving("commands_late", 200.0)
+    goal = TrajectoryGoal(to(Q_START, 0.3))
+    for given in (goal, to(Q_START, 0.3)):
+        cell.gate.take(given, cell.now_s)
+    cell.hold()
+    assert (goal.state, goal.code) == (GoalState.ABORTED, GoalCode.INVALID_GOAL)
+    stood = cell.advance(0.6).q[-1]
+    assert at_end(cell) == pytest.approx(stood, abs=1e-12)
 
 
 def test_commands_are_rejected():
