@@ -380,7 +380,7 @@ class JointReadings:
         self._rate, self._noise, self._n = rate_hz, noise_rad, n
         self._faults, self._draws = faults, draws
         self._next, self._stamp_s = 0, 0.0
-        self._stuck: float | None = None
+        self._stuck: tuple[int, float] | None = None  # an encoder, and what it shows
         self._page = lru_cache(KEPT_PAGES)(self._page_of)
 
     def due(self, now_s: float) -> NDArray[np.int64]:
@@ -400,9 +400,9 @@ class JointReadings:
         if joint < 0:
             self._stuck = None
         elif len(q):  # one encoder shows what it showed when the fault began
-            if self._stuck is None:
-                self._stuck = float(q[0, joint])
-            q[:, joint], qd[:, joint] = self._stuck, 0.0
+            if self._stuck is None or self._stuck[0] != joint:
+                self._stuck = joint, float(q[0, joint])
+            q[:, joint], qd[:, joint] = self._stuck[1], 0.0
         if "lost_messages" in faults:
             chance = self._paged(Stream.LOST_READINGS, number, 1, uniform=True)[:, 0]
             kept = np.asarray(chance >= faults.size("lost_messages"))

@@ -236,6 +236,20 @@ def test_a_fault_may_begin_in_the_middle_of_a_motion():
     assert cell.advance(1.3).q[0, 0] == pytest.approx(HOME[0] + 0.3)
 
 
+def test_the_next_encoder_that_stands_still_shows_its_own_joint():
+    cell = cell_of(7, EFFECTS)
+    cell.follow([1.0], [HOME + 0.3 * np.arange(6)])
+    for joint in (4, 2):
+        cell.set_fault("frozen_encoder", joint + 1.0)
+        came = cell.advance(cell.now_s + 0.2)
+        true, _ = cell.motion.at(came.time_s)
+        off = np.abs(came.q - true)
+        assert np.ptp(came.q[:, joint]) == 0.0
+        assert off[0, joint] < 1e-5
+        assert off[-1, joint] > 1e-3
+        assert np.max(np.delete(off, joint, axis=1)) < 1e-5
+
+
 @pytest.mark.parametrize(
     ("fault", "size"),
     [
