@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole cell: what its robot does to it, and what it shows of that."""
 
+import re
 from dataclasses import replace
 from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,6 +50,7 @@ from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.driving import approach, measuring
 from robocal_ros.tool.run import MeasuringPlan
 
+PAGE = Path(__file__).parents[2] / "docs" / "simulation.md"
 SILENT = replace(Effects(), noise=False, outliers=False)
 
 
@@ -249,6 +253,15 @@ def test_samples_for_sessions_say_what_happened():
     assert [s.stamp_ns for s in balls] == [10**18 + round(s.time_s * 1e9) for s in came.shots]
     for sample, shot in zip(balls, came.shots, strict=True):
         assert np.linalg.norm(sample.position_m - shot.centre) < 6.0 * sample.sigma_m
+
+
+def test_the_sample_of_the_page_runs():
+    (sample,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    made: dict[str, Any] = {}
+    exec(sample, made)
+    assert made["came"].shots
+    off_m = np.linalg.norm(made["error_m"], axis=1)
+    assert off_m == pytest.approx(np.full(len(WORK), 2e-3), rel=0.1)
 
 
 def test_the_programme_keeps_its_speed_and_rests():
