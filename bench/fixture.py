@@ -55,8 +55,10 @@ class Said:
 
     @property
     def doubtful(self) -> float:
-        """Share in which it was in doubt whether the right thing has moved."""
-        return self._share(lambda r: self.truth in _findings(r)[1])
+        """Share in which it was in doubt whether the right thing has moved; any, of nothing."""
+        return self._share(
+            lambda r: self.truth in _findings(r)[1] if self.truth else bool(_findings(r)[1])
+        )
 
     @property
     def wrong(self) -> int:
@@ -158,8 +160,7 @@ def resumed_table(cells: Sequence[MeasuredFixture]) -> Table:
             moved.append(cell.gap("fixture_moved", size_m, backwards=visits))
             off.append(1e3 * cell.worst_m(moved[-1], "fixture_moved", size_m))
         nothing, fixture = Said("", still), Said(NAME, moved)
-        doubt = float(np.mean([bool(_findings(result)[1]) for result in still]))
-        figures = nothing.told, doubt, nothing.wrong
+        figures = nothing.told, nothing.doubtful, nothing.wrong
         figures += fixture.told, fixture.doubtful, fixture.wrong
         table.add(words, 1e3 * max(away), *figures, max(off))
     return table
