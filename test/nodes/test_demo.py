@@ -17,8 +17,10 @@ from robocal_msgs.msg import MaintenanceStatus
 from bench.live.cell import SERIAL, TRUTH
 from bench.live.graph import CellController, LiveError
 from bench.live.lines import Answer, Look
-from bench.live.plc import Plc
+from bench.live.plc import Gap, Plc
 from bench.processes import ENDS_WITH_PARENT
+from bench.soak_shift import _add_gaps
+from bench.tables import Table
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.cell_sim.trajectory_controller import ROOM
 from robocal_ros.ground.errors import Code
@@ -205,3 +207,17 @@ def test_only_a_gap_that_closed_by_its_own_rule_is_given_again(fault, graph, mon
             assert (line.ran, line.acknowledged, line.is_open) == (["gap"], 0, False)
     finally:
         controller.close()
+
+
+def test_the_live_shift_counts_what_came_of_every_try_of_a_gap():
+    broken, ended, whole = (
+        SimpleNamespace(accepted=numbers, code=Code.ACCEPT, complete=numbers != [1])
+        for numbers in ([1], [2, 3], [4])
+    )
+    gaps = [Gap("gap-1", 120.0, 110.0, (broken, ended)), Gap("gap-2", 120.0, 60.0, (whole,))]
+    table = Table("soak", "", ("what", "value", "goal"))
+    _add_gaps(table, gaps)
+    told = {what: value for what, value, _ in table.rows}
+    assert told["gaps that left something over"] == 1
+    assert told["came into force"] == 4
+    assert not table.met
