@@ -38,6 +38,7 @@ def record(path: Path) -> None:
         bent, rng = RoundTool.cylinder(BENT, RADIUS_M), np.random.default_rng(SEED)
         program = SweepProgram(cell.program.cell, bent, rng, START_NS)
         cell.program = program
+        cell.truth(BENT)
 
         def swept(R: Array, name: str, x_m: float | None = None, lost: str = "") -> str:
             samples: list[Sample] = program.sweep(R, TAUGHT[:3, 3], name, x_m)

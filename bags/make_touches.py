@@ -29,6 +29,7 @@ def record(path: Path) -> None:
         BagWriter(path, latched=[EVENTS]) as bag,
     ):
         cell = Recorder(bag, history)
+        cell.truth(BENT)
         program = cell.program
         arm, near = program.cell.arm, program.cell.q_near
         rng = np.random.default_rng(3)

@@ -21,6 +21,7 @@ from rosbags import rosbag2
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagReader, BagWriter, bag_info, read_bag
 from robocal_ros.bags.mcap_files import ros_types
+from robocal_ros.cli.recording import is_simulated
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import joint_sample, pose_sample
 
@@ -28,6 +29,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
 NAMES = ["joint1", "joint2"]
 MS = 1_000_000
+GOLDEN = sorted((Path(__file__).parents[2] / "bags").glob("*.mcap"))
 
 
 def joint_state(stamp_ns: int, *position: float) -> dict[str, Any]:
@@ -536,3 +538,9 @@ def test_the_messages_are_those_of_ros(tmp_path: Path) -> None:
     for recorded, original in zip(read_bag(path, raw=True), (state, pose_message), strict=True):
         back = rclpy.serialization.deserialize_message(recorded.message, type(original))
         assert back == original
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
+def test_golden_bags_say_that_they_are_simulated(path):
+    with BagReader(path) as bag:
+        assert is_simulated(bag)
