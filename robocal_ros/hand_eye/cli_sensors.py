@@ -87,7 +87,7 @@ from robocal_ros.hand_eye.planning import (
     check_plan,
     planned_target,
 )
-from robocal_ros.hand_eye.profiles import Profile
+from robocal_ros.hand_eye.profiles import Profile, SensorDescription
 from robocal_ros.hand_eye.result import HandEyeResult
 from robocal_ros.hand_eye.targets import (
     FARTHEST_MM,
@@ -390,7 +390,8 @@ def run_tracker(args: argparse.Namespace) -> CliResult:
         target = TrackerTarget(args.radius_mm * 1e-3, args.radius_mm * 1e-3)
     else:
         target = read_tracker_target(args.target)
-    data, rejected = _read(args, robot.arm)
+    sensor = described(args)
+    data, rejected = _read(args, robot.arm, sensor)
     noise = TrackerNoise()
     if args.tracker_sigma_mm is not None:
         noise = replace(noise, tracker_m=args.tracker_sigma_mm * 1e-3)
@@ -398,15 +399,16 @@ def run_tracker(args: argparse.Namespace) -> CliResult:
         noise = replace(noise, joint_rad=radians(args.joint_sigma_deg))
     if args.joint_sigma_mm is not None:
         noise = replace(noise, joint_m=args.joint_sigma_mm * 1e-3)
-    result = solve_tracker(
-        data, target, noise, args.method, args.limit_mm * 1e-3, joint_error_rad(args)
-    )
+    limit_m, joint_rad = args.limit_mm * 1e-3, joint_error_rad(args)
+    result = solve_tracker(data, target, noise, args.method, limit_m, joint_rad, sensor.towards)
     warn(warnings)
     result = replace(result, rejected={**rejected, **result.rejected})
     return CliResult(drawn_document(result, args, {}), _show_tracker)
 
 
-def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[str, str]]:
+def _read(
+    args: argparse.Namespace, arm: SerialArm, sensor: SensorDescription
+) -> tuple[TrackerData, dict[str, str]]:
     """All measurements, and the profiles that show next to nothing, with why."""
     arcs, sphere, faces = read_tracker_points(args.points, arm)
     table = read_pose_table(args.poses, arm)
@@ -417,7 +419,7 @@ def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[s
             file=str(args.poses),
             row=1,
         )
-    shots = read_profiles(args.profiles, table, described(args))
+    shots = read_profiles(args.profiles, table, sensor)
     rejected = {
         name: str(shot)
         for name, shot in zip(table.names, shots, strict=True)

@@ -250,7 +250,10 @@ def _solved_tracker(
     )
     noise = TrackerNoise(config.tracker_sigma_m, config.joint_sigma_rad, config.joint_sigma_m)
     target: Any = target_of(data.target)
-    result = solve_tracker(measured, target, noise, method, config.limit_m, config.joint_error_rad)
+    result = solve_tracker(
+        measured, target, noise, method, config.limit_m, config.joint_error_rad,
+        config.sensor.towards,
+    )  # fmt: skip
     handles = {f"{m} {i}": str(one.handle) for m in ROLES for i, one in enumerate(of[m], 1)}
     rejected = {handles.get(name, name): why for name, why in result.rejected.items()}
     return replace(result, rejected=rejected)

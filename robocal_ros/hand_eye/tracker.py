@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.estimation import Estimate, solve
+from robocal_ros.estimation.surfaces import mirror
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.ground.frames import Array
@@ -479,11 +480,17 @@ def solve_tracker(
     method: Method = "best",
     limit_m: float = LIMIT_M,
     joint_error_rad: float = 0.0,
+    towards: bool = False,
 ) -> HandEyeResult:
     """Calibrate; ``limit_m``: largest error to expect at the working distance that is accepted.
 
-    ``joint_error_rad``: see `HandEyeSettings`.
+    ``joint_error_rad``: see `HandEyeSettings`. ``towards``: z of the profiles grows towards the
+    sensor (a height), not away from it (a distance).
     """
+    if towards:
+        away = [replace(one, points=one.points * mirror(towards)) for one in data.profiles]
+        data = replace(data, profiles=away)
+        return _turned(solve_tracker(data, target, noise, method, limit_m, joint_error_rad))
     classic = solve_classic(data, target, noise)
     problem, estimate = solve_best(classic)
     best = _result(classic, estimate.state, "best")
@@ -563,6 +570,17 @@ def _classic(classic: Classic, best: HandEyeResult, limit_m: float) -> HandEyeRe
         leave_one_out_m=_left_out(classic, states),
         working_error_m=error_m,
         verdict=judge_classic(away_m, error_m, limit_m) if best.verdict.accept else best.verdict,
+    )
+
+
+def _turned(result: HandEyeResult) -> HandEyeResult:
+    """A result for the same profiles with -z in place of z: half a turn about the sensor's x."""
+    half = frames.transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    both, covariance = np.kron(np.eye(2), half[:3, :3]), result.covariance
+    return replace(
+        result,
+        T_flange_sensor=result.T_flange_sensor @ half,
+        covariance=None if covariance is None else both @ covariance @ both,
     )
 
 

@@ -468,7 +468,8 @@ class _CubeSearch:
                 f"face_2 do in the tracker ({np.degrees(self.tracked.angle):.2f} deg; sphere "
                 f"{self.tracked.heights[0] * 1e3:.2f} and {self.tracked.heights[1] * 1e3:.2f} mm "
                 "above them): were other faces touched, did the target move, is the reflector's "
-                "radius right?"
+                "radius right, does z of the profiles grow the way that the sensor's description "
+                "says (z_grows)?"
             )
         matches.sort(key=lambda match: match.mismatch_m)
         first = matches[0]

@@ -9,6 +9,7 @@ import pytest
 from command import robocal, robocal_json
 from tracker_files import SCAN, tracker_files
 
+from bench.hand_eye_files import write_profile
 from bench.laser_tracker import TrackerCell, prp_cell, six_axis_cell
 from bench.measured_runs import Q_NEAR
 from robocal_ros.ground import frames
@@ -129,6 +130,19 @@ def test_an_unlit_profile_is_named(folder, tmp_path):
     found = run(made)
     assert found["rejected"] == [name]
     assert name not in found["residual_mm"]["per_sample"]
+
+
+def test_a_description_says_which_way_z_grows(folder, tmp_path):
+    made = tmp_path / "heights"
+    made.mkdir()
+    for one in tracker_files(made, cell()).profiles:
+        write_profile(made / SCAN / f"{one.name}.csv", one.points * [1.0, -1.0])
+    plain, found = run(folder), run(made, "--sensor", "keyence")
+    for key in ("sigma", "working_error_mm"):
+        assert found[key] == plain[key]
+    x, y, z, w = plain["T_flange_sensor"]["quat_xyzw"]
+    turned = np.array([w, z, -y, -x])  # half a turn about x after it
+    assert abs(turned @ found["T_flange_sensor"]["quat_xyzw"]) == pytest.approx(1.0, abs=1e-12)
 
 
 def edited(folder: Path, tmp_path: Path, name: str, old: str, new: str) -> Path:

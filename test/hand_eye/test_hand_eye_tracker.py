@@ -484,6 +484,25 @@ def test_profiles_with_x_reversed_are_of_a_sensor_that_is_turned_about_its_beam(
     assert np.all(np.abs(away[:3, 3]) < np.sqrt(np.diag(clean().covariance))[:3])
 
 
+@pytest.mark.parametrize("method", ["best", "classic"])
+def test_a_sensor_that_tells_heights_is_placed_in_its_own_axes(method):
+    """z = 0 lies 0.2 m before the other's origin; y follows by the right-hand rule."""
+    made = cell("prp")
+    heights = [replace(p, points=p.points * [1.0, -1.0] + [0.0, 0.2]) for p in noisy().profiles]
+    data = replace(noisy(), profiles=heights)
+    found = solve_tracker(data, made.sizes.target, made.sizes.noise, method, towards=True)
+    ahead = frames.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.2])
+    away = frames.invert(clean(method).T_flange_sensor @ ahead) @ found.T_flange_sensor
+    assert np.abs(away - np.eye(4)).max() < 1e-5  # closed form and descent stop at 1e-6
+    assert found.working_error_m == pytest.approx(clean(method).working_error_m, rel=1e-2)
+
+
+def test_z_that_grows_the_other_way_is_asked_for():
+    heights = [replace(p, points=p.points * [1.0, -1.0]) for p in noisy().profiles]
+    with pytest.raises(ResidualError, match="does z of the profiles grow the way"):
+        solve(replace(noisy(), profiles=heights))
+
+
 def test_another_face_of_the_cube_is_no_match():
     """The tracker's face_2 is one that the scan does not show."""
     made = cell("prp")

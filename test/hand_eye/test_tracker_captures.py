@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import beyond_rounding, robocal_json
-from hand_eye_driver import ARM, FRAME, Driver, tracker_point
+from hand_eye_driver import ARM, FRAME, LASER, Driver, tracker_point
 from scipy.stats import chi2
 from tracked_robot import CELL, START, Capture, captured, captures, marks, scans_of_marks
 
@@ -68,6 +68,20 @@ def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
     assert driver.ask(events.LOAD, set=again, path=str(path)).done
     repeated = driver.ask(events.CALIBRATE)
     assert repeated.document == document
+
+
+def test_a_sensor_that_tells_heights_is_found_too(tmp_path):
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        config = HandEyeConfig(sensor_frame=FRAME, sensor=LASER)
+        driver = Driver(HandEyeSession(ARM, history, config, "test"))
+        captured(driver, captures(towards=True))
+        outcome = driver.ask(events.CALIBRATE)
+        assert outcome.status is Code.ACCEPT, outcome.message
+        found = np.array(history.model(outcome.calibration_id)["T_parent_sensor"])
+    truth = CELL.T_flange_sensor @ np.diag([1.0, -1.0, -1.0, 1.0])
+    off = increment(found, truth, np.zeros(3))
+    spread = np.array(outcome.document["covariance_at_pivot"])
+    assert off @ np.linalg.solve(spread, off) < chi2.ppf(0.9999, 6)
 
 
 def test_a_point_that_was_misread_is_named_by_its_capture(driver):

@@ -9,6 +9,7 @@ import numpy as np
 from hand_eye_driver import ARM, Q_NEAR, Driver, Recorded, profile, tracker_point
 
 from bench.laser_tracker import CUBE_M, TrackerCell, six_axis_cell, true_flange
+from robocal_ros.estimation.surfaces import mirror
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.data import SCAN
 from robocal_ros.hand_eye.targets import FACES, SPHERE, target_document
@@ -44,8 +45,11 @@ def _seen(point: np.ndarray) -> Callable[[int], Recorded]:
     return lambda stamp_ns: tracker_point(stamp_ns, point)
 
 
-def captures() -> Iterator[Capture]:
-    """Every other point of the arcs and third profile of the scan, and five points of each face."""
+def captures(towards: bool = False) -> Iterator[Capture]:
+    """Every other point of the arcs and third profile of the scan, and five points of each face.
+
+    ``towards``: z of the profiles grows towards the sensor.
+    """
     data = measured()
     for arc in data.arcs:
         for q, point in zip(arc.q[::2], arc.points[::2], strict=True):
@@ -57,7 +61,8 @@ def captures() -> Iterator[Capture]:
         for point in points[CORNERS]:
             yield Capture(still, name, _seen(point))
     for q, shown in list(zip(data.q, data.profiles, strict=True))[::3]:
-        yield Capture(q, SCAN, lambda stamp_ns, p=shown.points: profile(stamp_ns, p))
+        points = shown.points * mirror(towards)
+        yield Capture(q, SCAN, lambda stamp_ns, p=points: profile(stamp_ns, p))
 
 
 def captured(driver: Driver, shots: Iterable[Capture]) -> None:
