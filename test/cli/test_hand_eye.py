@@ -592,3 +592,15 @@ class TestVerify:
         result.write_text(json.dumps(document))
         found = robocal("export", "--result", result, "--format", "urdf", status=2)
         assert f"accept {str(accept).lower()} and code {code}" in found["error"]["message"]
+
+    def test_what_people_took_back_is_not_exported(self, result):
+        """As ``robocal history show --json`` tells it: the verdict alone accepts it for ever."""
+        document = json.loads(result.read_text())
+        run = ["export", "--result", result, "--format", "urdf"]
+        for state, status in (("in_force", 0), ("rejected", 2), ("rolled_back", 2)):
+            shown = {"calibration": {"id": 1, "state": state}, "document": document}
+            result.write_text(json.dumps(shown))
+            found = robocal(*run, status=status)
+            if status:
+                told = state.replace("_", " ")
+                assert f"calibration was {told}: export one" in found["error"]["message"]
