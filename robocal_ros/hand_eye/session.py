@@ -371,8 +371,9 @@ class HandEyeSession(SessionBase):
         topic = self.data.topic_of(capture.mark)
         for shot in self._shots.since(topic, max(capture.from_ns, self._seen_ns)):
             try:
-                shot.read()
-                reading = self.stream.standstill(shot.stamp_ns, self.config.standstill)
+                if self.stream.standstill(shot.stamp_ns, self.config.standstill) is None:
+                    break
+                shot.read()  # which keeps its pixels: of a whole move they would take gigabytes
             except NotStillError as error:
                 self._why, self._seen_ns = error, shot.stamp_ns + 1
                 continue
@@ -380,8 +381,6 @@ class HandEyeSession(SessionBase):
                 self.refuse(shot.topic, error)
                 self._seen_ns = shot.stamp_ns + 1
                 continue
-            if reading is None:
-                break
             arguments = {"handle": capture.handle, "shot_ns": shot.stamp_ns}
             self._found = Command(events.SAMPLE, arguments, self.newest_joints_ns)
             return

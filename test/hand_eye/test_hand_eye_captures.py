@@ -115,6 +115,24 @@ def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkey
     assert len(kept) == MOST_BYTES // 1_000_000
 
 
+def test_shots_of_a_moving_robot_are_not_read(history, monkeypatch):
+    """What was read is kept with the shot: of images that is many times what came."""
+    driver = begun(history)
+    read = []
+    points = hand_eye_data.cloud_profile
+    monkeypatch.setattr(
+        hand_eye_data, "cloud_profile", lambda m, sensor: read.append(m) or points(m, sensor)
+    )
+    assert driver.ask(events.CAPTURE).done
+    for number in (1, 0, 1, 0):
+        driver.robot.move(SHOTS[number][0], 0.3)
+        driver.robot.rest(0.2, SHOTS[number][1])
+    assert not read
+    driver.robot.rest(0.6, SHOTS[0][1])
+    assert last_capture(driver).code is Code.ACCEPT
+    assert len(read) == 1
+
+
 def test_the_given_error_of_the_robot_is_the_one_that_is_used(history):
     """The error to expect is that of the robot's poses, four times as large, and the profiles'."""
     told = {}
