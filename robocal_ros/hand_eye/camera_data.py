@@ -119,6 +119,7 @@ STEP_S = 0.01
 LEAST_OVERLAP = 0.5  # of the shorter stream
 LEAST_CORRELATION = 0.6
 CLOCK_JUMP_NS = 1_000_000_000
+LONGEST_PAUSE_NS = 3600 * CLOCK_JUMP_NS  # a first stamp of 0 is 50 years before the next one
 LONGEST_GAP = 5.0  # usual periods between two robot poses that are interpolated
 
 
@@ -159,8 +160,8 @@ def stream_of(stamp_ns: NDArray[np.int64], T: Array, names: tuple[str, ...], ori
 
     Poses that came late are put in order, repeated stamps count once.
 
-    Raises `InputError` when stamps go back by more than a second; `TooFewSamplesError`: fewer than
-    20 poses.
+    Raises `InputError` when stamps go back by more than a second, or ahead by more than an hour;
+    `TooFewSamplesError`: fewer than 20 poses, or those of a quarter of a second.
     """
     back = -np.diff(stamp_ns)
     if len(back) and back.max() > CLOCK_JUMP_NS:
@@ -173,6 +174,17 @@ def stream_of(stamp_ns: NDArray[np.int64], T: Array, names: tuple[str, ...], ori
     if len(stamps) < FEWEST_POSES:
         raise TooFewSamplesError(
             f"{len(stamps)} {what} poses are no stream (at least {FEWEST_POSES})"
+        )
+    ahead, row = int(np.diff(stamps).max()), int(np.argmax(np.diff(stamps))) + 1
+    if ahead > LONGEST_PAUSE_NS:
+        raise InputError(
+            f"the stamps of the {what} poses leap ahead by {ahead * 1e-9:.1f} s at sample "
+            f"{names[first[row]]}: give one run, on one clock, all of it stamped"
+        )
+    lasting_s = float(stamps[-1] - stamps[0]) * 1e-9
+    if lasting_s <= SPAN_S + STEP_S:
+        raise TooFewSamplesError(
+            f"the {what} poses last {lasting_s:.3f} s: record both for 20 s or more, stamped in s"
         )
     time_s = np.asarray((stamps - origin_ns) * 1e-9, dtype=np.float64)
     return PoseStream(time_s, T[first], tuple(names[i] for i in first))

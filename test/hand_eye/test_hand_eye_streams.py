@@ -180,6 +180,11 @@ def test_stamps_are_put_in_order_or_refused() -> None:
         stream_of(np.where(np.arange(30) < 20, stamps, stamps - 2_020_000_000), T, names, 0, "x")
     with pytest.raises(TooFewSamplesError, match="no stream"):
         stream_of(stamps[:12], T[:12], names[:12], 0, "robot")
+    since_1970 = np.where(np.arange(30) < 1, 0, stamps + 1_700_000_000 * 10**9)
+    with pytest.raises(InputError, match=r"leap ahead by 17\d{8}\.\d s at sample 1:"):
+        stream_of(since_1970, T, names, 0, "robot")
+    with pytest.raises(TooFewSamplesError, match=r"robot poses last 0\.058 s"):
+        stream_of(stamps // 10, T, names, 0, "robot")
 
 
 def test_interpolation_follows_a_screw() -> None:
