@@ -210,12 +210,14 @@ def _from_poses(args: argparse.Namespace) -> HandEyeResult:
 
 def _paired(robot: PoseTable, camera: PoseTable, mount: Any) -> tuple[PosePairs, dict[str, str]]:
     """Pairs of the same sample, or row; and the samples that only one table has."""
-    if not robot.named and not camera.named and len(robot) != len(camera):
-        raise InputError(
-            f"has {len(camera)} rows, {robot.path} has {len(robot)}: name them in a column sample "
-            "in both tables, or give stamp_s in both",
-            file=camera.path,
-        )
+    if not robot.named and not camera.named:
+        if len(robot) != len(camera):
+            raise InputError(
+                f"has {len(camera)} rows, {robot.path} has {len(robot)}: name them in a column "
+                "sample in both tables, or give stamp_s in both",
+                file=camera.path,
+            )
+        camera = replace(camera, names=robot.names)  # blank lines in either one count for nothing
     place = {name: index for index, name in enumerate(camera.names)}
     rows = np.array(
         [index for index, name in enumerate(robot.names) if name in place], dtype=np.int64

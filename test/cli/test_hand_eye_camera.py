@@ -207,6 +207,22 @@ def test_tables_of_different_length_are_refused(robocal, folder: Path) -> None:
     assert "has 11 rows" in document["error"]["message"]
 
 
+def test_a_blank_line_in_a_table_shifts_no_pairs(robocal, folder: Path) -> None:
+    tables = {"plain": "camera_poses", "boards": "board_poses"}
+    for name, of in tables.items():
+        lines = (folder / f"{of}.csv").read_text().splitlines()[: 14 + 1]
+        rows = [line.split(",", 1)[1] for line in lines]  # without the sample
+        (folder / f"{name}.csv").write_text("\n".join(rows) + "\n")
+        rows.insert(8, "")
+        (folder / f"{name}_parted.csv").write_text("\n".join(rows) + "\n")
+    plain = robocal("--poses", "plain.csv", "--measured", "boards.csv")
+    assert len(plain["residual_mm"]["per_sample"]) == 14
+    for robot, camera in (("plain", "boards_parted"), ("plain_parted", "boards")):
+        found = robocal("--poses", f"{robot}.csv", "--measured", f"{camera}.csv")
+        assert found["covariance"] == plain["covariance"]
+        assert found["rejected"] == []
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
