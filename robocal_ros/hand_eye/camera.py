@@ -521,7 +521,8 @@ def joint_errors(fit: PairFit, size_rad: float, given: GivenNoise) -> JointError
     rows = PoseRows(J, G, fit.estimate.covariance / fit.estimate.scale**2, slice(0, 6))
     noise = PoseNoise(fit.noise.position_m, fit.noise.turn_rad)
     told = fit.covariance[:6, :6]
-    return beside_found_noise(rows, errors, noise, told, size_rad, given.robot_m is not None)
+    known = given.robot_m is not None and pairs.covariance is not None
+    return beside_found_noise(rows, errors, noise, told, size_rad, known)
 
 
 def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:

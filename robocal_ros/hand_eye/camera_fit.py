@@ -475,6 +475,8 @@ _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several varianc
 class GivenNoise:
     """What is known of the noise, standard deviations per axis; None is estimated.
 
+    ``robot_m`` counts where the pairs have a covariance of the camera's side. Without one positions
+    of both sides scatter together, and what they do is estimated.
     ``camera_scale``: factor of the sigmas in the covariance that board poses have: 1 to trust it.
     What is told of corners alone knows nothing of a lens or a board that are not as assumed.
     """

@@ -12,9 +12,21 @@ from long_form import amount
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import IN_HAND, TO_HAND
-from bench.hand_eye_joints import NARROW_RAD, SIZE_RAD, WIDE_RAD, camera_run, repeated, tracker_run
+from bench.hand_eye_joints import (
+    NARROW_RAD,
+    SIZE_RAD,
+    WIDE_RAD,
+    camera_cell,
+    camera_pairs,
+    camera_run,
+    repeated,
+    tracker_run,
+    ur10,
+)
 from bench.laser_tracker import six_axis_cell
 from bench.measured_runs import Q_NEAR
+from robocal_ros.hand_eye.camera import joint_errors
+from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs
 from robocal_ros.hand_eye.result import hand_eye_document
 from robocal_ros.hand_eye.tracker import solve_tracker
 from robocal_ros.kinematics.joint_errors import HONEST
@@ -54,6 +66,17 @@ def test_a_robot_that_shows_less_scatter_errs_less(case):
     assert refused == 0
     assert low / HONEST < found.came < HONEST * high
     assert found.size_rad < (0.1 if case == "tracker" else 0.7) * SIZE_RAD
+
+
+def test_joints_err_by_no_more_than_positions_of_both_sides_scatter():
+    """Which is found, whatever is given of the robot's: of tables a camera has no covariance."""
+    rng = np.random.default_rng(4)
+    fit = fit_pairs(camera_pairs(camera_cell(IN_HAND), ur10(rng), WIDE_RAD, rng))
+    found, given = (joint_errors(fit, 1e-2, known) for known in (GivenNoise(), GivenNoise(1e-4)))
+    assert found is not None
+    assert given is not None
+    assert found.size_rad < 2e-3
+    assert (given.size_rad, given.factor) == (found.size_rad, found.factor)
 
 
 def test_nothing_else_of_a_result_changes():
