@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands of ``robocal tool``: beams, crossed, points, parallel, export.
+"""Commands of ``robocal tool``: beams, station, crossed, points, parallel, export.
 
 ``crossed`` gives of one circle the place of its axis, of a whole run tip and axis.
 """
@@ -60,7 +60,6 @@ from robocal_ros.tool.files import (
 )
 from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run, tip_errors
 from robocal_ros.tool.laser_frame import LaserFile, calibrate_laser, read_laser_for, write_laser
-from robocal_ros.tool.run import alike
 from robocal_ros.tool.station import StationTrend, measurement_of, station_shift
 from robocal_ros.tool.touch_points import fit_four, fit_parallel, fit_seven
 
@@ -506,9 +505,14 @@ def run_station(args: argparse.Namespace) -> CliResult:
         path = str(history.path)
     if not entries:
         raise InputError("no laser frame was measured: mode LASER_FRAME of tcf_node", file=path)
-    of = [[model["made_with"], model["mandrel"]] for model in models]
-    kept = [(e, m) for e, m, own in zip(entries, models, of, strict=True) if alike(own, of[-1])]
-    first = measurement_of(kept[0][1])
+    # Of another mandrel, radius or laser file the node compares with another first one.
+    began = models[-1]["first"]
+    kept = [
+        (entry, model)
+        for entry, model in zip(entries, models, strict=True)
+        if model["first"]["points_m"] == began["points_m"]
+    ]
+    first = measurement_of(began)
     later = [(entry, measurement_of(model)) for entry, model in kept[1:]]
     shifts = [station_shift(first, found) for _, found in later]
     stamps = [entry.stamp_ns for entry, _ in later]

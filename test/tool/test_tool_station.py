@@ -253,14 +253,24 @@ def driver(tmp_path):
         yield made
 
 
-def test_another_radius_as_told_is_another_first_time(driver):
-    """What is told of a mandrel moves no station."""
+def test_another_radius_as_told_is_another_first_time(driver, tmp_path):
+    """What is told of a mandrel moves no station; the command counts from there, too."""
     assert driver.measure("laser", cycle_id="c1").status is Code.ACCEPT
     mended = replace(driver.session.config, mandrel_radius_m=RADIUS_M + 3e-4)
     driver.session = ToolSession(driver.cell.arm, driver.history, mended, "test")
     assert driver.session.current.commissioned_station is None
-    assert driver.measure("laser", cycle_id="c2").status is Code.ACCEPT
+    anew = driver.measure("laser", cycle_id="c2")
+    assert anew.status is Code.ACCEPT
     assert driver.session.current.commissioned_station is not None
+    later = driver.measure("laser", cycle_id="c3")
+    assert later.status is Code.ACCEPT
+    document = robocal_json(
+        "tool.station.json", "tool", "station", "--robot", "ur10", "--robot-serial", "K1",
+        "--state", tmp_path,
+    )  # fmt: skip
+    assert document["first_stamp_ns"] == driver.history.get(anew.calibration_id).stamp_ns
+    assert [row["calibration"] for row in document["measured"]] == [later.calibration_id]
+    assert document["trend"] == later.document["trend"]
 
 
 def test_a_station_is_commissioned_and_followed(driver, tmp_path):
