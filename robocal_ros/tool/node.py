@@ -544,7 +544,7 @@ class TcfNode(SessionNode[ToolSession]):
         if session is None or history is None:
             return
         current = session.current
-        heads = current.head, current.thermal, current.healthy, current.station
+        heads = current.head, current.thermal, current.healthy, current.mandrel, current.station
         shown = tuple(head.revision for head in heads)
         if self._shown == shown and not self._outputs.events.need_configuration:
             return

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """tcf_node over DDS: a simulated robot drives what the node announces."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,13 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from robocal_msgs.action import MeasureTool
-from robocal_msgs.msg import CalibrationQuality, GapOpen, MaintenanceStatus, ToolFrame
+from robocal_msgs.msg import (
+    CalibrationQuality,
+    GapOpen,
+    MaintenanceStatus,
+    SessionEvent,
+    ToolFrame,
+)
 from robocal_msgs.srv import Decide
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
@@ -23,12 +31,18 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.ros import conversions, endpoints
-from robocal_ros.session.events import ACCEPT, Command
+from robocal_ros.ros.session_node import EVENTS
+from robocal_ros.session.events import ACCEPT, CONFIGURE, Command
 from robocal_ros.tool.session import ToolSession
 
 QUICK = MeasureTool.Goal.QUICK
 MANDREL = bent(TAUGHT, [-0.02, 0.01, -0.01], [0.0, 0.0, 0.0])
 RADIUS_MM = 2.5
+OF_MANDREL = {
+    "mandrel_xyz_mm": (1e3 * MANDREL[:3, 3]).tolist(),
+    "mandrel_quat_xyzw": frames.quat_xyzw(MANDREL).tolist(),
+    "mandrel_radius_mm": RADIUS_MM,
+}
 CHI2_6 = 22.5  # of six, one in a thousand
 
 
@@ -237,15 +251,25 @@ def test_a_laser_of_another_robot_is_refused(graph: Any, tmp_path: Any) -> None:
     assert other.state == "unconfigured"
 
 
+def test_a_recording_that_begins_later_knows_how_the_mandrel_measures(
+    graph: Any, tmp_path: Path
+) -> None:
+    """Of what was commanded before it the last configuration alone is left."""
+    live = graph.collect(SessionEvent, "/tcf_node/session_events", EVENTS)
+    cell = LiveCell(graph, tmp_path, MANDREL, **OF_MANDREL)
+    result = cell.measure(MeasureTool.Goal.WITNESS_REFERENCE)
+    assert (result.success, result.status) == (True, Code.ACCEPT), result.message
+
+    def told() -> bool:
+        last = [event for event in live if event.command == CONFIGURE][-1:]
+        return any(json.loads(event.arguments)["arguments"]["mandrel"] for event in last)
+
+    graph.spin_until(told, "the configuration with the mandrel")
+
+
 def test_the_laser_frame_is_measured_and_told(graph: Any, tmp_path: Any) -> None:
     """Its own beams, with a mandrel."""
-    settings = {
-        "mandrel_xyz_mm": (1e3 * MANDREL[:3, 3]).tolist(),
-        "mandrel_quat_xyzw": frames.quat_xyzw(MANDREL).tolist(),
-        "mandrel_radius_mm": RADIUS_MM,
-    }
-    cell = LiveCell(graph, tmp_path, TAUGHT, **settings)
-    cell.program.tool = RoundTool.cylinder(MANDREL, 1e-3 * RADIUS_MM)
+    cell = LiveCell(graph, tmp_path, MANDREL, **OF_MANDREL)
     told = graph.collect(PoseWithCovarianceStamped, "/tcf_node/laser_frame", endpoints.LATCHED)
     result = cell.measure(MeasureTool.Goal.LASER_FRAME, "commissioning")
     assert result.success, result.message
