@@ -237,15 +237,17 @@ def changed_tool(taught: Array, healthy: KnownTool, measured: KnownTool) -> Know
     return KnownTool(T, covariance, measured.own_covariance, healthy.T_flange_tool)
 
 
-def judge_healthy(found: KnownTool, estimate: ToolEstimate, taught: Array) -> Verdict:
-    """Whether a tool measures as a healthy one does: known well, and near the taught one.
+def judge_healthy(
+    found: KnownTool, estimate: ToolEstimate, taught: Array, limits: ToolLimits, name: str
+) -> Verdict:
+    """Whether a tool, or the mandrel, measures as a healthy one: known well, near the taught one.
 
-    Between them lie the robot's absolute error and the laser frame's, no bump.
+    Between them lie the robot's absolute error and the laser frame's, no bump. ``name``: in words.
     """
-    run = judge_run(estimate, ToolLimits())
+    run = judge_run(estimate, limits)
     off = change_between(taught, found.T_flange_tool)
     what = (
-        f"the taught tool measures {off.tip_m * 1e3:.3f} mm and {np.degrees(off.axis_rad):.3f} deg "
+        f"the {name} measures {off.tip_m * 1e3:.3f} mm and {np.degrees(off.axis_rad):.3f} deg "
         f"off; {run.reason}"
     )
     if not run.accept:
@@ -253,8 +255,8 @@ def judge_healthy(found: KnownTool, estimate: ToolEstimate, taught: Array) -> Ve
     if off.tip_m > HEALTHY_M or off.axis_rad > HEALTHY_RAD:
         return Verdict(
             Code.LIMIT_EXCEEDED,
-            f"{what}; allowed {HEALTHY_M * 1e3:.0f} mm and {np.degrees(HEALTHY_RAD):.0f} deg: is "
-            "the tool bent, or taught wrongly?",
+            f"{what}; allowed {HEALTHY_M * 1e3:g} mm and {np.degrees(HEALTHY_RAD):g} deg: is it "
+            "bent, or told wrongly?",
         )
     return Verdict(Code.ACCEPT, f"{what}: later runs give the change against this")
 
@@ -269,7 +271,7 @@ def judge_run(estimate: ToolEstimate, limits: ToolLimits) -> Verdict:
     if not sigma <= limits.sigma_m:
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
-            f"{words} (allowed sigma {limits.sigma_m * 1e3:.1f} mm): read the beams faster, or "
+            f"{words} (allowed sigma {limits.sigma_m * 1e3:g} mm): read the beams faster, or "
             "place them more exactly",
         )
     return Verdict(Code.ACCEPT, words)
@@ -301,8 +303,8 @@ def judge_tool(
         return Verdict(
             Code.LIMIT_EXCEEDED,
             f"{what}; {total.tip_m * 1e3:.2f} mm and {np.degrees(total.axis_rad):.2f} deg from the "
-            f"taught tool (allowed {limits.change_m * 1e3:.0f} mm, "
-            f"{np.degrees(limits.tilt_rad):.0f} deg): straighten or change the tool",
+            f"taught tool (allowed {limits.change_m * 1e3:g} mm, "
+            f"{np.degrees(limits.tilt_rad):g} deg): straighten or change the tool",
         )
     if unchanged(found, in_force):
         return Verdict(Code.NO_SIGNIFICANT_GAIN, f"{what}; the tool has not moved")

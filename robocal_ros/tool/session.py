@@ -217,7 +217,8 @@ class ToolResults:
         self._station = self._changed = None  # what was said of them before holds no more
         taught, mandrel = self.taught(run.mode), run.mode == WITNESS_REFERENCE
         kind = MANDREL if mandrel else HEALTHY_TOOL
-        verdict = judge_healthy(found, estimate, taught)
+        name = "mandrel" if mandrel else "taught tool"
+        verdict = judge_healthy(found, estimate, taught, self._config.limits, name)
         if not mandrel and self._current.model is not None:
             verdict = replace(verdict, reason=f"{verdict.reason}; {self._other_in_force()}")
         document: Document = {**run_document(found, estimate, run.circles, verdict)}

@@ -238,7 +238,7 @@ def station_verdict(
                 "and the laser file's reach_mm say: where the radius is wrong the height is"
             )
         if not found.sigma_m <= sigma_limit_m:
-            words += f"; allowed {1e3 * sigma_limit_m:.1f} mm: read the beams faster, or repeat it"
+            words += f"; allowed {1e3 * sigma_limit_m:g} mm: read the beams faster, or repeat it"
             return Verdict(Code.RESIDUAL_TOO_LARGE, words)
         return Verdict(Code.ACCEPT, words)
     words = (

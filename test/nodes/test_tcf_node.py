@@ -259,6 +259,7 @@ def test_a_recording_that_begins_later_knows_how_the_mandrel_measures(
     cell = LiveCell(graph, tmp_path, MANDREL, **OF_MANDREL)
     result = cell.measure(MeasureTool.Goal.WITNESS_REFERENCE)
     assert (result.success, result.status) == (True, Code.ACCEPT), result.message
+    assert result.message.startswith("the mandrel measures ")
 
     def told() -> bool:
         last = [event for event in live if event.command == CONFIGURE][-1:]

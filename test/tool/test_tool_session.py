@@ -23,7 +23,7 @@ from robocal_ros.session.events import (
     bring_into_force,
 )
 from robocal_ros.tool.edges import BeamEdge, EdgeSample
-from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.judging import KnownTool, ToolLimits
 from robocal_ros.tool.laser_frame import LaserFile, read_laser, write_laser
 from robocal_ros.tool.run import SAME, ToolConfig, rows_of
 from robocal_ros.tool.session import ToolSession
@@ -149,6 +149,22 @@ def test_the_healthy_tool_takes_the_robots_absolute_error_away(history):
     # Turned by the tilt of 0.064 rad, 0.4 mm of the laser's error leaves 0.026 mm beside the noise.
     wide = found.covariance[:3, :3] + np.eye(3) * (0.064 * np.linalg.norm(off)) ** 2
     assert away @ np.linalg.solve(wide, away) < 16.3
+
+
+def test_a_healthy_tool_is_known_as_well_as_a_tool_must_be(history):
+    """`sigma_limit_mm` holds in mode REFERENCE too, and the message has it as it was set."""
+    driver = driver_of(history, TAUGHT, limits=ToolLimits(sigma_m=2e-5))
+    refused = driver.measure("reference")
+    assert refused.status is Code.RESIDUAL_TOO_LARGE, refused.message
+    assert "allowed sigma 0.02 mm" in refused.message
+    assert driver.session.current.measured_healthy is None
+
+
+def test_a_change_beyond_what_may_be_is_refused_with_the_limits_as_they_were_set(history):
+    limits = ToolLimits(change_m=1.5e-3, tilt_rad=np.radians(0.5))
+    refused = driver_of(history, TRUTH, limits=limits).measure()
+    assert refused.status is Code.LIMIT_EXCEEDED, refused.message
+    assert "(allowed 1.5 mm, 0.5 deg)" in refused.message
 
 
 def test_a_cycle_that_has_ended_is_answered_again(history):
@@ -401,6 +417,7 @@ def test_a_bent_tool_is_no_healthy_one(history):
     driver = driver_of(history, bent(TAUGHT, [0.008, 0.0, 0.0], [0.0, 0.1, 0.0]))
     outcome = driver.measure("reference")
     assert outcome.status is Code.LIMIT_EXCEEDED
+    assert "allowed 3 mm and 1.5 deg" in outcome.message
     assert driver.session.current.measured_healthy is None
 
 
