@@ -9,7 +9,7 @@ alike: it is not in the sigma, and cancels in a change. Nor can a run tell a wro
 that reach further: so what its shadows are wider than both say counts in the frame's height.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -393,6 +393,9 @@ class StationTrend:
         return cls(model["from_ns"], model["to_ns"], model["count"], matrix, right)
 
 
+ANSWER_OF: Mapping[Code, str] = {Code.ACCEPT: "pass", Code.STATION_MOVED: "recalibrate"}
+
+
 def result_document(
     found: StationMeasurement,
     shift: StationShift,
@@ -403,7 +406,7 @@ def result_document(
 ) -> Document:
     """What a run's caller is told; ``commissioned``: whether there was a first one before it."""
     return {
-        "answer": "pass" if verdict.accept else "recalibrate",
+        "answer": ANSWER_OF.get(verdict.code, "cannot tell"),
         "change": {"tip_mm": 1e3 * shift.size_m, "axis_deg": np.degrees(shift.turned_rad)},
         "sigma_mm": [1e3 * (shift.sigma_m if commissioned else found.sigma_m)],
         "misfit_mm": 1e3 * found.misfit_m,

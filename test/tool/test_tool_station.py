@@ -32,6 +32,7 @@ from robocal_ros.tool.station import (
     measure_station,
     measurement_document,
     measurement_of,
+    result_document,
     station_shift,
     station_verdict,
 )
@@ -225,10 +226,16 @@ def test_beams_that_are_known_badly_are_no_answer():
     first = station_verdict(shaky, None, 2e-4, 2.5e-4)
     assert first.code is Code.RESIDUAL_TOO_LARGE
     assert "allowed 0.25 mm" in first.reason
+    none = station_shift(shaky, shaky)
+    told = result_document(shaky, none, StationTrend(), first, commissioned=False)
+    assert told["answer"] == "cannot tell"
     points = shaky.laser.points + np.array([4e-4, 0.0, 0.0])
     away = station_shift(shaky, replace(shaky, laser=replace(shaky.laser, points=points)))
     assert not away.moved
-    assert station_verdict(shaky, away, 2e-4, 2e-4).code is Code.TOO_FEW_SAMPLES
+    later = station_verdict(shaky, away, 2e-4, 2e-4)
+    assert later.code is Code.TOO_FEW_SAMPLES
+    told = result_document(shaky, away, StationTrend(), later, commissioned=True)
+    assert told["answer"] == "cannot tell"
 
 
 def test_a_measurement_is_kept_bit_for_bit():
