@@ -369,8 +369,8 @@ INPUTS = {JOINTS: (JointState, endpoints.STREAM), EDGES: (BeamEvent, endpoints.R
 class TcfNode(SessionNode[ToolSession]):
     """Drives a `ToolSession` with live messages and calls.
 
-    ``last``: outcome of the last run, None before any; ``run_end``: becomes that of the open run;
-    ``step``: that is awaited.
+    ``last``: outcome of the last run, None before any; ``run_end``: becomes that of the open run,
+    done while none is; ``step``: that is awaited.
     """
 
     NAME = "tcf_node"
@@ -411,6 +411,8 @@ class TcfNode(SessionNode[ToolSession]):
         super().activate()
         self.last: Outcome | None = None
         self.run_end: Future = Future()
+        self.run_end.set_result(None)
+        self._cycle_id = ""  # of the last run
         self._shown: tuple[int, ...] | None = None
         self._silence = Silence()
         if self._motion is not None and self._session is not None:
@@ -488,26 +490,27 @@ class TcfNode(SessionNode[ToolSession]):
         name = outcome.command.name
         if outcome.repeated or self._session is None:
             return
+        if name == MEASURE_TOOL and outcome.done:
+            self.run_end, self.last = Future(), None
+            self._cycle_id = str(outcome.command.arguments.get("cycle_id", ""))
         try:
             self._outputs.events.tell(outcome.command, outcome)
-            if name == MEASURE_TOOL and outcome.done:
-                self.run_end, self.last = Future(), None
             if name in (MEASURE_TOOL, TOOL_STEP, BREAK_OFF):
                 self._show_step(f"{name}: {outcome.status.name} {outcome.message}")
             self.show_in_force()
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{name} was done but not published: {error}")
-        if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None and not self.last:
+        ends = name in (TOOL_STEP, BREAK_OFF) and self._session.run is None
+        if ends and not self.run_end.done():
             self.last = outcome
             if self._motion is not None:
                 self._motion.run_ended(outcome)
-            self._show_result(outcome)
-            if not self.run_end.done():
-                self.run_end.set_result(outcome)
+            self._show_result(outcome, self._cycle_id)
+            self.run_end.set_result(outcome)
         elif name in (SOLVE_TOUCHES, SOLVE_SWEEPS):
             self._show_result(outcome)
 
-    def _show_result(self, outcome: Outcome) -> None:
+    def _show_result(self, outcome: Outcome, cycle_id: str = "") -> None:
         """Publish what was measured, and its verdict."""
         try:
             if outcome.calibration_id and self._history is not None:
@@ -515,7 +518,7 @@ class TcfNode(SessionNode[ToolSession]):
                 of_laser = "points_m" in model
                 show = self._outputs.laser if of_laser else self._outputs.candidate
                 show(model, outcome.command.stamp_ns or 0)
-            self._outputs.quality(outcome)
+            self._outputs.quality(outcome, cycle_id)
         except RobocalError as error:  # the caller is answered all the same
             self.get_logger().error(f"it is measured but was not published: {error}")
 

@@ -194,15 +194,15 @@ class TcfOutputs:
         message.pose.covariance = found.frame_covariance.ravel()
         self._laser.publish(message)
 
-    def quality(self, outcome: Outcome) -> None:
-        """Show the verdict on a run."""
+    def quality(self, outcome: Outcome, cycle_id: str) -> None:
+        """Show the verdict on a run, or on what touches or sweeps gave."""
         document = outcome.document or {}
         message = conversions.verdict_message(
             outcome,
             robot=self._robot,
             serial=self._serial,
             stamp=conversions.header(outcome.command.stamp_ns or 0, self._base),
-            cycle_id=str(document.get("cycle_id", "")),
+            cycle_id=cycle_id,
         )
         if "misfit_mm" in document:
             message.candidate_rms_mm = float(document["misfit_mm"])

@@ -55,9 +55,13 @@ def test_a_bent_tool_is_measured_accepted_and_published(graph: Any, cell: LiveCe
     tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     frame = graph.collect(TransformStamped, "/tcf_node/tool_frame", endpoints.LATCHED)
     tools = graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
-    result = cell.measure()
+    verdicts = graph.collect(CalibrationQuality, "/tcf_node/quality", endpoints.LATCHED)
+    result = cell.measure(cycle_id="gap-7")
     assert result.success, result.message
     assert result.status == CalibrationQuality.ACCEPT
+    graph.spin_until(lambda: verdicts, "the verdict")
+    (verdict,) = verdicts
+    assert (verdict.candidate_id, verdict.cycle_id) == (result.candidate_id, "gap-7")
     covariance = np.array(result.tool.covariance).reshape(5, 5)
     away = matrix_of(result.tool.tool)[:3, 3] - TRUTH[:3, 3]
     assert away @ np.linalg.solve(covariance[:3, :3], away) < 16.3  # chi-square, 1e-3
@@ -179,7 +183,9 @@ def test_it_moves_with_a_heartbeat_that_echoes_the_beats_of_maintenance_node(
 
 def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Any) -> None:
     cell = LiveCell(graph, tmp_path, TRUTH, joint_silence_s=5.0)
+    verdicts = graph.collect(CalibrationQuality, "/tcf_node/quality", endpoints.LATCHED)
     cell.rest(0.1)
+    assert not graph.call(Trigger, "/tcf_node/cancel_trigger").success  # of no run
     nothing = graph.call(Trigger, "/tcf_node/result_trigger")
     assert (nothing.success, nothing.message) == (False, "0 CONFLICT no run has ended yet")
     begun = graph.call(Trigger, "/tcf_node/measure_trigger")
@@ -191,6 +197,8 @@ def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Any) -> None:
     result = graph.call(Trigger, "/tcf_node/result_trigger")
     assert result.success
     assert result.message.startswith("1 ACCEPT tip ")
+    graph.spin_until(lambda: verdicts, "the verdict")
+    assert [verdict.candidate_id for verdict in verdicts] == [1]
     accepted = graph.call(Trigger, "/tcf_node/accept_trigger")
     assert accepted.message == "1 ACCEPT revision 1: calibration 1 in force"
     back = graph.call(Trigger, "/tcf_node/rollback_trigger")
