@@ -56,7 +56,7 @@ from robocal_ros.session.events import (
 )
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.driving import load_measuring
-from robocal_ros.tool.edges import EDGES, InputRule, ParallelStation
+from robocal_ros.tool.edges import BEAMS, EDGES, InputRule, ParallelStation
 from robocal_ros.tool.judging import CheckRule, ToolLimits
 from robocal_ros.tool.laser_frame import LaserFrame, read_laser_for
 from robocal_ros.tool.run import MeasuringMotion, PlannedStep, ToolConfig, TraitLimits, rows_of
@@ -195,12 +195,17 @@ def parallel_station(settings: Mapping[str, Any]) -> ParallelStation | None:
     near each other.
     """
     up, down, x = (1e-3 * settings[f"parallel_{key}_mm"] for key in ("up", "down", "x"))
-    names = tuple(settings["parallel_beams"])
     if up == down == 0.0:
         return None
-    if len({*names, *settings["beams"]}) != 4:
-        raise InputError(f"beams {settings['beams']} and parallel_beams {names}: two names each")
-    return ParallelStation(up, down, x, (names[0], names[1]))
+    return ParallelStation(up, down, x, two_names(settings, "parallel_beams"))
+
+
+def two_names(settings: Mapping[str, Any], parameter: str) -> tuple[str, str]:
+    """Names of two beams. Raises `InputError` where they are not two."""
+    names = settings[parameter]
+    if len(names) != 2 or names[0] == names[1]:
+        raise InputError(f"{parameter} {names}: two names are wanted, one of each beam")
+    return names[0], names[1]
 
 
 def session_config(
@@ -209,17 +214,24 @@ def session_config(
     station: str,
     taught: NDArray[np.float64],
 ) -> ToolConfig:
-    """Settings of the session, in SI; ``laser`` None: there are parallel beams alone."""
+    """Settings of the session, in SI; ``laser`` None: there are parallel beams alone.
+
+    Raises as `parallel_station`; `InputError` when beams that there are share a name.
+    """
     reach = np.zeros(2) if laser is None else laser.reach
+    parallel = parallel_station(settings)
+    beams = BEAMS if laser is None else two_names(settings, "beams")
+    if laser is not None and parallel is not None and {*beams} & {*parallel.names}:
+        raise InputError(f"beams {beams} and parallel_beams {parallel.names}: a name of each beam")
     return ToolConfig(
         points_m=() if laser is None else rows_of(laser.points),
-        parallel=parallel_station(settings),
+        parallel=parallel,
         taught=rows_of(taught),
         mandrel=None if (T := given_pose(settings, "mandrel")) is None else rows_of(T),
         laser_sigma_m=0.0 if laser is None else laser.sigma_m,
         reach_m=(float(reach[0]), float(reach[1])),
         station=station,
-        beams=tuple(settings["beams"]),
+        beams=beams,
         mandrel_radius_m=settings["mandrel_radius_mm"] * 1e-3,
         taper=settings["taper"],
         spin_rad=float(np.radians(settings["spin_deg"])),

@@ -28,11 +28,13 @@ from transforms import away_of, matrix_of
 from bench.measured_runs import laser_of
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session.events import ACCEPT, CONFIGURE, Command
+from robocal_ros.tool.node import TcfNode, session_config
+from robocal_ros.tool.run import ToolConfig
 from robocal_ros.tool.session import ToolSession
 
 QUICK = MeasureTool.Goal.QUICK
@@ -257,6 +259,36 @@ def test_a_laser_of_another_robot_is_refused(graph: Any, tmp_path: Any) -> None:
         namespace="other",
     )
     assert other.state == "unconfigured"
+
+
+PARALLEL = {"parallel_up_mm": 400.0, "parallel_down_mm": 360.0}
+
+
+def config_by(**given: Any) -> ToolConfig:
+    """Of a node with these parameters."""
+    settings = {setting.name: setting.default for setting in TcfNode.SETTINGS} | given
+    return session_config(settings, noisy_cell().laser if settings["laser"] else None, "", TAUGHT)
+
+
+@pytest.mark.parametrize(
+    "named",
+    [
+        {"beams": ["x"]},
+        {"beams": ["x", "x"]},
+        {"beams": ["x", "y", "up", "down"]},  # adapter_node's, for all nodes
+        {"beams": ["x", "up"]} | PARALLEL,
+        {"parallel_beams": ["up"]} | PARALLEL,
+    ],
+)
+def test_beams_that_no_names_tell_apart_are_refused(named: Any) -> None:
+    with pytest.raises(InputError, match="beams"):
+        config_by(laser="laser.yaml", **named)
+
+
+def test_parallel_beams_alone_are_named_as_they_like() -> None:
+    """Adapter_node, which `beams` is for too, has no others then."""
+    names = {"beams": ["up", "down"], "parallel_beams": ["up", "down"]}
+    assert config_by(**names, **PARALLEL).beam_names == {"up": "up", "down": "down"}
 
 
 def test_a_recording_that_begins_later_knows_how_the_mandrel_measures(
