@@ -47,12 +47,13 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
     """T_flange_tool (4, 4) from ``tcp_mm`` and ``quat_xyzw``.
 
     ``rotation``: R_flange_tool (3, 3) for a document of touches, which tell the tip alone; another
-    one takes none.
+    one takes none. As the history shows it the tool has the one that it comes into force with.
 
     Raises `InputError`, naming file and key, when one of them is missing, null or no measurement,
     and when the document's verdict does not accept the tool.
     """
     top = read_fields(path, "tool file")
+    kept = top.below("model") if {"document", "model"} <= top.values.keys() else None
     if "document" in top.values:  # as the history shows it
         top = top.below("document")
     if "error" in top.values:
@@ -70,6 +71,8 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
         if abs(length - 1.0) > QUATERNION_TOLERANCE:
             top.fail(f"has length {length:.6g}, not 1", "quat_xyzw")
         return frames.transform_from_quat(xyz, quat)
+    if rotation is None and kept is not None:
+        rotation = np.array(kept.rows("T_flange_tool", 4, 4))[:3, :3]
     if rotation is None:
         top.fail("is missing or null: give the tool's roll, pitch and yaw too", "quat_xyzw")
     return frames.transform(rotation, xyz)

@@ -292,6 +292,16 @@ def test_a_tool_that_is_none_is_refused(tmp_path, document, words):
         read_tool(path)
 
 
+def test_of_the_history_a_tool_has_the_orientation_that_it_comes_into_force_with(tmp_path):
+    """Touches and sweeps have none in their document."""
+    T = frames.transform(frames.exp_rotation([0.1, -0.2, 0.3]), [1e-3, 2e-3, 3e-3])
+    path = tmp_path / "tool.json"
+    shown = {"document": {"tcp_mm": [1, 2, 3]}, "model": {"T_flange_tool": T.tolist()}}
+    path.write_text(json.dumps(shown))
+    assert read_tool(path) == pytest.approx(T)
+    assert read_tool(path, np.eye(3))[:3, :3] == pytest.approx(np.eye(3))
+
+
 def test_an_orientation_is_given_once(tmp_path):
     path = tmp_path / "tool.json"
     path.write_text(json.dumps({"tcp_mm": [1, 2, 3], "quat_xyzw": [0, 0, 0, 1]}))
