@@ -31,7 +31,13 @@ from robocal_ros.hand_eye.mount_problem import (
     same_pose,
 )
 from robocal_ros.hand_eye.profiles import SensorDescription, SensorRange
-from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, at_origin, expected_error_m
+from robocal_ros.hand_eye.result import (
+    AIM_M,
+    HandEyeSettings,
+    PoseNoise,
+    at_origin,
+    expected_error_m,
+)
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.stairs import StepTask
 from robocal_ros.hand_eye.targets import (
@@ -101,10 +107,10 @@ def check_plan(
 ) -> PlanReport:
     """Judge planned flange poses (m, 4, 4), with an approximate T_flange_sensor (4, 4).
 
-    ``noise``: of poses; None: that of a good robot. ``limit_m``: largest expected error (rms) of a
-    point at the working distance.
+    ``noise``: of poses, and of light that is laid by eye; None: that of a good robot. ``limit_m``:
+    largest expected error (rms) of a point at the working distance.
     """
-    noise = noise or PoseNoise(ROBOT_SIGMA_M, 0.0)
+    noise = noise or PoseNoise(ROBOT_SIGMA_M, 0.0, AIM_M)
     sensor, place = target.sensor, target.place(T_base_flange @ T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
     whole = target.view(T_base_flange, T_flange_sensor, place)

@@ -35,6 +35,7 @@ METHODS: tuple[Method, ...] = ("best", "classic")
 MOST_REJECTED = 1.0 / 3.0
 LARGEST_RMS_M = 2e-3  # of samples from the target
 ARM_M = 3.0  # a turn of the flange counts as the shift that goes with it there
+AIM_M = 1e-4  # by which the eye misses a mark with the light, one sigma, where no shots tell it
 STRIDE = 8  # of the points that tell the field of view
 OUTSIDE = 0.02  # share of points beyond it on each side: spikes
 
@@ -81,11 +82,11 @@ class HandEyeSettings:
     joint_error_rad: float = 0.0
 
     def noise(self) -> PoseNoise | None:
-        """Of reported poses; None where it is to be estimated."""
+        """Of reported poses, and of the eye; None where it is to be estimated."""
         if self.robot_sigma_m is None:
             return None
         turn = self.robot_sigma_m / ARM_M if self.robot_sigma_rad is None else self.robot_sigma_rad
-        return PoseNoise(self.robot_sigma_m, turn)
+        return PoseNoise(self.robot_sigma_m, turn, AIM_M)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,19 @@ from hand_eye_sets import (
     data_of,
     sphere_task,
     stairs_target,
+    step_task,
 )
 from long_form import more
 from scipy.optimize import minimize
 
-from bench.hand_eye_cell import SimulatedShots, TrueStairs, edge_shots, sphere_shots, step_shots
+from bench.hand_eye_cell import (
+    PoseRobot,
+    SimulatedShots,
+    TrueStairs,
+    edge_shots,
+    sphere_shots,
+    step_shots,
+)
 from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
@@ -84,6 +92,20 @@ def test_expected_error_is_that_of_a_calibration_from_these_poses():
     assert plan.rank == plan.unknowns == 9
     achieved = np.sqrt(np.diag(at_origin(result.covariance, result.pivot)))
     assert plan.sigma == pytest.approx(achieved, rel=0.1)  # the robot's error rules, not the arc
+
+
+def test_light_is_laid_on_marks_by_eye():
+    """Along the edges, nearly the laser plane's normal, it is what a calm robot's shots err by."""
+    calm = PoseRobot(2e-5, 2e-5)
+    rng = np.random.default_rng(5)
+    shots = step_shots(replace(CELL, robot=calm), STAIRS, 16, rng, aim_m=1e-4)
+    settings = HandEyeSettings(calm.position_m, calm.rotation_rad)
+    result = solve_task(step_task(), data_of(shots), "best", settings)
+    stairs, X = PlannedStairs(stairs_target(), SENSOR, ("near", "far")), CELL.T_flange_sensor
+    plan = check_plan(stairs, shots.true_T_base_flange, X, settings.noise(), LIMIT_M)
+    achieved = np.sqrt(np.diag(at_origin(result.covariance, result.pivot)))
+    # How well the eye aims is found from 16 shots, two numbers each: to an eighth.
+    assert plan.sigma[1] == pytest.approx(achieved[1], rel=0.4)
 
 
 @pytest.mark.parametrize("strays", [0, 2])
