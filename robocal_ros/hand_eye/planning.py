@@ -17,7 +17,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.hand_eye.data import DataSet
+from robocal_ros.hand_eye.data import POINT, DataSet
 from robocal_ros.hand_eye.mount_fit import OPEN_M, joined, open_directions
 from robocal_ros.hand_eye.mount_problem import (
     LineModel,
@@ -645,7 +645,7 @@ def judged_plan(
     if centre is not None and data.kind != "sphere":
         raise InputError(f"center is a sphere's, not a {data.kind}'s: leave it out")
     target = target_of(data.target)
-    if data.kind == "camera" or isinstance(target, BoardTarget | TrackerTarget):
+    if data.kind in ("camera", POINT) or isinstance(target, BoardTarget | TrackerTarget):
         raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
     given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
     middle = None if centre is None else centre.tolist()

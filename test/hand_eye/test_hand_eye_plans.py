@@ -168,12 +168,13 @@ def test_a_plan_that_will_do_is_told_from_one_that_will_not(name):
     assert bad.working_error_m is None or bad.working_error_m > good.working_error_m
 
 
-def test_plans_with_wrong_marks_or_of_a_camera_are_refused():
+def test_plans_with_wrong_marks_or_of_no_line_laser_s_target_are_refused():
     shots = sphere_set()[1]
     step = TARGETS["step"][0]
     with pytest.raises(InputError, match="none of the target's: near, far"):
         plan(step, shots, ["middle"] * len(shots.q))
     with pytest.raises(InputError, match="2 marks for 14 poses"):
         plan(step, shots, ["near", "far"])
-    with pytest.raises(InputError, match="not for a camera"):
-        plan({"target": {"kind": "camera"}}, shots)
+    for kind in ("camera", "point"):  # marked points judge a sensor's place, they find none
+        with pytest.raises(InputError, match=f"not for a {kind}"):
+            plan({"target": {"kind": kind}}, shots)
