@@ -339,8 +339,10 @@ class PlannedSphere:
     def unseen(self, view: TargetView) -> dict[int, str]:
         """Out of the field of view, or beside the sphere."""
         x, z, r = view.sightings.value.T
-        found = _out_of_range(x, z - self.sensor.sense * r, NEEDED * r, self.sensor)
-        for i in np.flatnonzero(r < SMALLEST * self.radius_m):
+        beside = r < SMALLEST * self.radius_m  # there the model's r is no circle's
+        arc = np.where(beside, BEHIND * self.radius_m, r)
+        found = _out_of_range(x, z - self.sensor.sense * arc, NEEDED * arc, self.sensor)
+        for i in np.flatnonzero(beside):
             found.setdefault(int(i), "the laser plane passes beside the sphere")
         return found
 

@@ -223,6 +223,21 @@ def test_a_pose_that_does_not_see_the_target_is_told():
     assert "mm" in plan.unseen[2]
 
 
+def test_a_laser_plane_beside_the_sphere_is_told_as_that():
+    """At the right height it is, however far aside; a sensor that is too high is too high."""
+    R = frames.exp_rotation([np.pi, 0.0, 0.0])
+
+    def told(aside_m: float, higher_m: float = 0.0) -> str:
+        at = np.array([0.0, aside_m, SENSOR.middle_m - BEHIND * RADIUS_M - higher_m])
+        sensor = frames.transform(R, CENTRE - R @ at)[None]
+        return judged(BALL, sensor @ frames.invert(CELL.T_flange_sensor)).unseen.get(0, "")
+
+    assert told(0.5 * RADIUS_M) == ""
+    for aside_m in (1.05 * RADIUS_M, 3.0 * RADIUS_M):
+        assert told(aside_m) == "the laser plane passes beside the sphere"
+        assert told(aside_m, 0.1) == "the target is at -100 mm, the sensor sees 10 to -10 mm"
+
+
 def test_a_moved_base_gives_the_same_judgement():
     poses = sphere_poses(8)
     T = frames.transform(frames.exp_rotation([0.2, 0.5, -0.7]), [1.0, 2.0, -0.5])
