@@ -469,7 +469,8 @@ def test_two_poses_cannot_tell_the_robots_noise():
     shots = data_of(step_shots(CELL, STAIRS, 2, np.random.default_rng(13), level=True))
     found = solve_step(shots)
     assert found.verdict.code is Code.TOO_FEW_SAMPLES
-    assert "robot's noise" in found.verdict.reason
+    assert "to tell the robot's noise" in found.verdict.reason
+    assert "show the target from more poses" in found.verdict.reason  # more shots tell no more
     assert solve_task(step_task(), shots, "classic", SETTINGS).verdict == found.verdict
 
 
