@@ -183,7 +183,7 @@ def judge_residuals(distances_m: Array, shots: int, lost: int) -> Verdict | None
         words = f"samples are off by {rms * 1e3:.2f} mm (allowed {LARGEST_RMS_M * 1e3:g} mm)"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
     if lost > MOST_REJECTED * shots:
-        words = f"{lost} of {shots} samples do not fit the others: see the rejected ones"
+        words = f"{lost} of {shots} samples show nothing or do not fit: see the rejected ones"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
     return None
 

@@ -541,7 +541,7 @@ def verify(
     far = distances((read.view,), state)
     if len(rejected) > len(fit):
         code = Code.RESIDUAL_TOO_LARGE
-        words = f"{words}, but {len(rejected)} do not fit at all"
+        words = f"{words}, but {len(rejected)} show nothing or do not fit"
     elif rms > settings.limit_m:
         code = Code.RESIDUAL_TOO_LARGE
         words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): the mount is not this one"

@@ -45,6 +45,7 @@ from robocal_ros.ground.errors import (
     RankDeficientError,
     ResidualError,
     RobocalError,
+    TooFewSamplesError,
 )
 from robocal_ros.hand_eye import solve as solving
 from robocal_ros.hand_eye.mount_fit import LARGEST_POSE_M, distances, first_look, fit_mount
@@ -357,6 +358,21 @@ def test_targets_together_find_a_wrong_radius(share):
     parts = [(sphere_task(SphereTarget(share * RADIUS_M)), ball), (line_task(), edge)]
     with pytest.raises(RobocalError, match="radius"):
         solve_joint(parts, SETTINGS)
+
+
+def test_profiles_that_show_nothing_are_not_said_to_contradict(data):
+    """Six of fifteen are too many to lose, and eight to judge: underexposed, not off."""
+
+    def dark(count):
+        empty = TooFewSamplesError("profile has 0 points")
+        return replace(data, profiles=[*data.profiles[:-count], *[empty] * count])
+
+    found = solve(dark(6)).verdict
+    assert found.code is Code.RESIDUAL_TOO_LARGE
+    assert found.reason == "6 of 15 samples show nothing or do not fit: see the rejected ones"
+    found = verify(sphere_task(), dark(8), TRUE, SETTINGS).verdict
+    assert found.code is Code.RESIDUAL_TOO_LARGE
+    assert found.reason.endswith(", but 8 show nothing or do not fit")
 
 
 def test_a_place_that_was_not_reached_blames_no_mount(result, monkeypatch):
