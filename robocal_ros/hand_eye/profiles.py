@@ -181,11 +181,18 @@ class SensorDescription:
         """What it sees; by the numbers where nothing is told of it.
 
         Of numbers that are distances the middle counts as 0 where z grows towards the sensor.
+
+        Raises `InputError` for heights where z grows away from it.
         """
         if self.near_mm is not None and self.far_mm is not None:
             near_mm, far_mm = self.near_mm, self.far_mm
         elif self.towards and near_mm < far_mm:
             near_mm, far_mm = 0.5 * (far_mm - near_mm), -0.5 * (far_mm - near_mm)
+        elif near_mm > far_mm and not self.towards:
+            raise InputError(
+                f"the sensor's field is given from {near_mm:g} to {far_mm:g} mm, but its z grows "
+                "away from it: say z_grows, or exchange the two"
+            )
         width_mm = width_mm if self.width_mm is None else self.width_mm
         noise_mm = noise_mm if self.noise_mm is None else self.noise_mm
         ends = near_mm * 1e-3, far_mm * 1e-3

@@ -364,6 +364,14 @@ def test_half_a_description_is_refused(tmp_path, text, words):
         sensor_of("nobody")
 
 
+def test_a_field_in_heights_is_no_field_of_a_sensor_that_tells_distances():
+    """A plan would be judged by the one, and the profiles be read by the other."""
+    field = (10.0, -10.0, 60.0, 0.037)
+    assert SensorDescription(z_grows="towards").seen_range(*field).sense == -1.0
+    with pytest.raises(InputError, match=r"from 10 to -10 mm, but its z grows away .*z_grows"):
+        SensorDescription(z_grows="away").seen_range(*field)
+
+
 def test_a_session_reads_what_its_sensor_tells(history):
     """Heights in mm, two profiles in a cloud: the samples are those of plain messages."""
     points = sphere_set()[1].profiles[0]
