@@ -412,7 +412,7 @@ def leave_one_out(
             return None  # a target that only this pose saw
         try:
             own[out] = distances(views, solved(rest))[out]
-        except RobocalError:
+        except (RobocalError, np.linalg.LinAlgError):  # a single shot of stairs leads nowhere
             return None
     return own
 

@@ -481,6 +481,15 @@ def test_a_sphere_that_was_knocked_is_not_the_poses_fault():
         solve(both)
 
 
+def test_one_of_two_tilted_shots_of_taught_stairs_places_no_sensor():
+    """Its corners lie on one line: nothing is told of each without itself."""
+    taught = stairs_target(user_sigma_m=1e-4, user_sigma_rad=1e-3)
+    shots = data_of(step_shots(CELL, STAIRS, 2, np.random.default_rng(13)))
+    found = solve_step(shots, taught)
+    assert found.verdict.code is Code.TOO_FEW_SAMPLES
+    assert found.leave_one_out_m is None
+
+
 def test_two_poses_cannot_tell_the_robots_noise():
     shots = data_of(step_shots(CELL, STAIRS, 2, np.random.default_rng(13), level=True))
     found = solve_step(shots)
