@@ -34,7 +34,7 @@ from robocal_ros.hand_eye.profiles import (
 )
 from robocal_ros.hand_eye.targets import ARCS, FACES, ROLES, SPHERE
 from robocal_ros.hand_eye.tracker_data import Arc
-from robocal_ros.history.history_records import CalibrationState
+from robocal_ros.history.history_records import UNDONE
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.kinematics.robots import read_fields, read_pose
@@ -65,7 +65,6 @@ PROFILE = ("x_mm", "z_mm")
 FILE_COLUMNS = ("profile", "image")
 BESIDE = ("sample", "stamp_s")  # for the user's own record
 FARTHEST_M = {"flange": 3.0, "base": 20.0}  # of a sensor from its parent
-UNDONE = (CalibrationState.REJECTED, CalibrationState.ROLLED_BACK)  # whatever its verdict was
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,6 +79,10 @@ class CalibrationState(StrEnum):
     """Was in force until it was rolled back."""
 
 
+UNDONE = (CalibrationState.REJECTED, CalibrationState.ROLLED_BACK)
+"""By a person, whatever its own verdict is."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
     """What is known of a calibration without opening its contents.

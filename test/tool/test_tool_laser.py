@@ -283,6 +283,10 @@ def test_there_must_be_a_file(path):
             {"tcp_mm": [1, 2, 3], "verdict": {"accept": False, "code": "LIMIT_EXCEEDED"}},
             "verdict is LIMIT_EXCEEDED: this tool was not accepted",
         ),
+        (
+            {"calibration": {"state": "rolled_back"}, "document": {"tcp_mm": [1, 2, 3]}},
+            "calibration was rolled back: export one that is in force",
+        ),
     ],
 )
 def test_a_tool_that_is_none_is_refused(tmp_path, document, words):
