@@ -36,6 +36,16 @@ class FlowStep:
     name: str = ""
 
 
+def labels_of(clean: str, label: re.Pattern[str]) -> tuple[list[FlowStep], str]:
+    """Labels, whose names are the first group, and the text with these blanked.
+
+    So that what stands behind one begins its line; every character stays at its place.
+    """
+    found = [*label.finditer(clean)]
+    steps = [FlowStep(one.start(), "label", name=one[1].lower()) for one in found]
+    return steps, label.sub(lambda one: " " * len(one[0]), clean)
+
+
 def flow_steps(clean: str, blocks: re.Pattern[str], calls: re.Pattern[str]) -> list[FlowStep]:
     """Blocks, jumps, routines and their calls; ``blocks``: its groups are named as `FlowStep.does`.
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import pose_of
-from robocal_ros.programs.flow import Flow, FlowStep, flow_steps
+from robocal_ros.programs.flow import Flow, FlowStep, flow_steps, labels_of
 from robocal_ros.programs.points import (
     NUMBER,
     OF_LINE,
@@ -67,7 +67,7 @@ _BLOCK = re.compile(
     re.M | re.I,
 )
 _LABEL = re.compile(
-    r"^[ \t]*(\d+(?=[ \t]+[A-Z]|[ \t]*:)|(?!(?:ANY|ELSE)\b)[A-Z]\w*(?=[ \t]*:))[ \t]*:?",
+    r"^[ \t]*(?!(?:ANY|ELSE|S?VALUE)\b)(\d+(?![\w.])|[A-Z]\w*(?=[ \t]*:))[ \t]*:?",
     re.M | re.I,
 )
 _CALL = re.compile(r"\bCALL[ \t]+([\w.]+)", re.I)
@@ -93,12 +93,7 @@ class KawasakiDialect(Dialect):
 
     def read(self, text: str) -> Program:
         """Locations that motions go to, and taught steps; of a file without programs all."""
-        clean = masked(text, ";")
-        labels = [
-            FlowStep(found.start(), "label", name=found[1].lower())
-            for found in _LABEL.finditer(clean)
-        ]
-        clean = _LABEL.sub(lambda found: " " * len(found[0]), clean)
+        labels, clean = labels_of(masked(text, ";"), _LABEL)
         headers = [*_HEADER.finditer(clean)]
         ends = [*(found.start() for found in headers), len(clean)][1:]
         sections = [(found[1], found.end(), end) for found, end in zip(headers, ends, strict=True)]

@@ -17,7 +17,7 @@ import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import DEGREE, pose_of
-from robocal_ros.programs.flow import Flow, FlowStep, flow_steps
+from robocal_ros.programs.flow import Flow, FlowStep, flow_steps, labels_of
 from robocal_ros.programs.points import (
     EDGE,
     OF_LINE,
@@ -74,10 +74,11 @@ _SET = re.compile(
 _BLOCK = re.compile(
     r"^[ \t]*(?:(?P<begin>IF|SWITCH)|(?P<loop>WHILE|FOR|LOOP|REPEAT)|(?P<branch>CASE|DEFAULT)"
     r"|(?P<else>ELSE)|(?P<leave>EXIT)|(?P<end>UNTIL|END(?:IF|SWITCH|WHILE|FOR|LOOP|FCT)?)"
-    r"|(?:GLOBAL[ \t]+)?DEF(?:FCT[ \t]+[\w\[\]]+)?[ \t]+(?P<alone>\w+)|GOTO[ \t]+(?P<jump>\w+)"
-    r"|(?P<label>[A-Z]\w*)(?=[ \t]*:))\b",
+    r"|(?:GLOBAL[ \t]+)?DEF(?:FCT[ \t]+[\w\[\]]+)?[ \t]+(?P<alone>\w+)"
+    r"|GOTO[ \t]+(?P<jump>[\w$]+))(?![\w$])",
     re.I | re.M,
 )
+_LABEL = re.compile(r"^[ \t]*([A-Z_$][\w$]*)[ \t]*:", re.I | re.M)
 _CALL = re.compile(r"\b(\w+)[ \t]*\(")
 _WITH = re.compile(
     rf"^(?P<motion>[ \t]*(?:(?P<block>(?:PTP_)?SPLINE)|{MOVES})\b[^\r\n=]*?\bWITH\b)[^\r\n]*",
@@ -264,8 +265,8 @@ def _without(clean: str) -> str:
 
 def _flow(text: str, clean: str, frames: dict[str, Array], inline: dict[str, str]) -> Flow:
     """What is set but by a WITH."""
-    clean = _without(clean)
-    steps = flow_steps(clean, _BLOCK, _CALL)
+    labels, clean = labels_of(_without(clean), _LABEL)
+    steps = labels + flow_steps(clean, _BLOCK, _CALL)
     for found in _SET.finditer(clean):
         names = _given(line_of(text, found.start()), found, frames, inline)
         steps.append(FlowStep(found.start(), "set", names))
