@@ -259,7 +259,10 @@ _UNDECIDED = (
 )
 
 # "0" is what comes next after "/"
-_FIXTURES = "SELECT DISTINCT kind FROM calibrations WHERE kind > ? AND kind < ? ORDER BY kind"
+_FIXTURES = (
+    "SELECT kind, max(id) FROM calibrations WHERE kind > ? AND kind < ? AND code IN (?, ?) "
+    "GROUP BY kind"
+)
 
 BUSY_TIMEOUT_S = 2.0
 """Longest wait for another process's change, itself a matter of milliseconds."""
@@ -419,11 +422,13 @@ class HistoryReader:
             rows = read_candidates(connection, _UNDECIDED, kind, revision, Code.ACCEPT, limit)
             return tuple(self._entry(*row) for row in rows)
 
-    def fixtures(self) -> tuple[str, ...]:
-        """Kinds of the fixtures that were ever measured; see `fixture_kind`."""
+    def fixtures(self) -> tuple[Entry, ...]:
+        """Of each fixture the last calibration that told where it stands, moved or not."""
+        told = Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN
         with self._reading() as connection:
-            rows = connection.execute(_FIXTURES, (f"{FIXTURE}/", f"{FIXTURE}0"))
-            return tuple(kind for (kind,) in rows)
+            found = connection.execute(_FIXTURES, (f"{FIXTURE}/", f"{FIXTURE}0", *told))
+            ids = [newest for _, newest in found]
+            return tuple(self._entry(one, read_candidate(connection, one)) for one in ids)
 
     def decisions(self, after_seq: int = 0, newest: int = -1) -> tuple[Decision, ...]:
         """Decisions of every kind after a sequence number, oldest first.

@@ -74,9 +74,12 @@ class Decider:
         return next(iter(self._history.pending(kind, 1)), None)
 
     def newest_fixture(self) -> Entry | None:
-        """The newest of the fixtures' that can be accepted now; None where nothing waits."""
-        found = [self.newest(kind) for kind in self._history.fixtures()]
-        return max((entry for entry in found if entry), key=lambda entry: entry.id, default=None)
+        """The newest of the fixtures' that can be accepted now; None where nothing waits.
+
+        One that stands again where it was in force needs no other frame.
+        """
+        found = (e for e in self._history.fixtures() if e.state is CalibrationState.PENDING)
+        return max(found, key=lambda entry: entry.id, default=None)
 
     def _outdated(self, entry: Entry) -> str:
         """Why it is STALE although its own kind's revision is in force; else empty."""

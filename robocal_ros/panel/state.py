@@ -202,8 +202,10 @@ class PanelState:
                 found.append(_task(code, "gap", words))
             elif code not in WELL:
                 found.append(Instruction("state/BROKEN_OFF", code.name, words))
-        told = self.sources[FIXTURE].values.get("candidate_id")  # it has an instruction of its own
-        if {status[name] for name in PENDING} - {0, told}:
+        waiting = {status[name] for name in PENDING} - {0}
+        if any(task.key == instruction_key(Code.ACCEPT, "fixture") for task in found):
+            waiting.discard(self.sources[FIXTURE].values["candidate_id"])
+        if waiting:
             found.append(Instruction("state/DECIDE"))
         found += self._corrected(now_s)
         if self.history_trouble:

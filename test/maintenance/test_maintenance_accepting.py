@@ -21,6 +21,7 @@ from maintenance_cell import (
     Cell,
     bent,
     config_of,
+    kept,
     opened,
     passed,
     proposed,
@@ -44,6 +45,7 @@ from robocal_ros.history.history_records import (
     Action,
     Decision,
     Head,
+    fixture_kind,
     insert_decision,
 )
 from robocal_ros.maintenance.accuracy import AcceptBounds
@@ -212,13 +214,15 @@ def test_a_status_is_no_pause_however_many_candidates_wait(cell):
     copied(history, proposed(history), 9_998)
     outdated = proposed(history, thermal_revision=3)
     copied(history, outdated, 10_000)
+    copied(history, kept(history, fixture_kind("plate"), {}), 9_999)
     copied(history, thermal_proposed(history, 1.0), 9_999)
     took_s = []
     for _ in range(5):
         begin_s = time.perf_counter()
         status = cell.session.status(cell.now_s)
         took_s.append(time.perf_counter() - begin_s)
-    assert (status.thermal_pending, status.tool_pending) == (30_000, 0)
+    pending = status.thermal_pending, status.tool_pending, status.fixture_pending
+    assert pending == (40_000, 0, 30_000)
     assert min(took_s) < 0.1 * STALL_S
     number = proposed(history)
     assert cell.session.status(cell.now_s).tool_pending == number

@@ -371,15 +371,23 @@ def test_an_acceptance_without_an_id_is_repeated_for_a_minute(cell):
 
 def test_a_fixture_waits_until_it_is_decided(cell):
     """Of several the newest; what is older than the one in force is outdated."""
-    history, fixtures = cell.history, (fixture_kind("plate"), fixture_kind("wheel"))
-    first, second, third = (kept(history, fixtures[n], {}) for n in (0, 1, 0))
-    assert history.fixtures() == fixtures
+    history, plate, wheel = cell.history, fixture_kind("plate"), fixture_kind("wheel")
+    first, second, third = (kept(history, kind, {}) for kind in (plate, wheel, plate))
+    kept(history, plate, {}, Code.RESIDUAL_TOO_LARGE)  # which tells nothing of where it stands
     for number, name in ((third, ACCEPT), (second, REJECT)):
         assert cell.session.status(cell.now_s).fixture_pending == number
         decide(cell, name, number)
     status = cell.session.status(cell.now_s)
     assert (status.fixture_pending, status.thermal_pending, status.tool_pending) == (0, 0, 0)
     assert history.get(first).state is CalibrationState.STALE
+
+
+def test_a_fixture_that_was_put_back_waits_no_more(cell):
+    plate = fixture_kind("plate")
+    moved = kept(cell.history, plate, {})
+    assert cell.session.status(cell.now_s).fixture_pending == moved
+    kept(cell.history, plate, {}, Code.NO_SIGNIFICANT_GAIN)
+    assert cell.session.status(cell.now_s).fixture_pending == 0
 
 
 def test_a_history_that_was_replaced_is_not_what_the_line_goes_by(history, tmp_path):

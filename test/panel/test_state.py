@@ -167,6 +167,8 @@ def test_a_fixture_that_moved_is_told_until_a_person_has_decided():
 def test_a_fixture_that_waits_since_before_the_panel_started_is_told_as_what_waits():
     """Also where the verdict that is heard is of another one, measured meanwhile."""
     assert keys(shown(**{STATUS: status(fixture_pending=9)})) == ["state/DECIDE"]
+    halted = status("FAULT", fixture_pending=9, fault_code=10, fault="left its plan")
+    assert keys(shown(**{FIXTURE: verdict(Code.ACCEPT, 9), STATUS: halted}))[1] == "state/DECIDE"
     other = shown(**{FIXTURE: verdict(Code.NO_SIGNIFICANT_GAIN), STATUS: status(fixture_pending=9)})
     assert keys(other) == ["state/DECIDE"]
 

@@ -422,12 +422,12 @@ def kinds(cell: Cell) -> list[str]:
     return [type(request).__name__ for request in cell.log]
 
 
-def kept(history: Any, kind: str, model: dict[str, Any]) -> int:
-    """A candidate that may be accepted."""
+def kept(history: Any, kind: str, model: dict[str, Any], code: Code = Code.ACCEPT) -> int:
+    """A candidate; one that may be accepted."""
     return history.propose(
         Proposal(
             kind=kind, model_hash=ARM.model_hash, based_on=history.head(kind).revision,
-            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT,
+            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=code,
             reason="", document={}, model=model,
         )
     )  # fmt: skip
