@@ -30,7 +30,7 @@ from robocal_ros.ground.files import read_bytes, read_text, write_bytes
 from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
-from robocal_ros.history.history_records import THERMAL
+from robocal_ros.history.history_records import THERMAL, void
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import ALPHA, BETA, THETA, arm_of, layer_of, payload_note
 from robocal_ros.kinematics.joint_functions import ArmLoad
@@ -155,7 +155,7 @@ def given_model(args: argparse.Namespace, nominal: SerialArm, warnings: list[str
     ``warnings`` takes what it may cost that these were others. Raises as `given_models`.
     """
     if args.model:
-        arm, identified = read_model(args.model, nominal)
+        arm, identified = read_model(args.model, nominal, in_use=True)
     else:
         with model_history(args, nominal) as history:
             chosen = history.head(THERMAL).calibration_id
@@ -169,12 +169,16 @@ def given_model(args: argparse.Namespace, nominal: SerialArm, warnings: list[str
     return arm
 
 
-def read_model(path: Path, nominal: SerialArm) -> tuple[SerialArm, ArmLoad | None]:
+def read_model(
+    path: Path, nominal: SerialArm, *, in_use: bool = False
+) -> tuple[SerialArm, ArmLoad | None]:
     """A robot as identified, carrying what the nominal arm does, and what it was identified with.
 
-    ``path``: a robot file, or a document with a ``model``.
+    ``path``: a robot file, or a document with a ``model``. ``in_use``: what the robot is to be
+    corrected with, which no person may have undone.
 
-    Raises `InputError` when it is neither, `WrongRobotError` for other joints than the nominal's.
+    Raises `InputError` when it is neither, or `void`; `WrongRobotError` for other joints than the
+    nominal's.
     """
     if path.suffix == ".json":
         try:
@@ -184,6 +188,8 @@ def read_model(path: Path, nominal: SerialArm) -> tuple[SerialArm, ArmLoad | Non
             _, identified = layer_of(model)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"holds no model: {error!r}", file=str(path)) from error
+        if in_use and (words := void(document)):
+            raise InputError(f"the calibration {words}", file=str(path))
     else:
         arm = describe_robot(str(path))[0].arm
         names, identified = arm.joint_names, arm.load

@@ -34,7 +34,7 @@ from robocal_ros.hand_eye.profiles import (
 )
 from robocal_ros.hand_eye.targets import ARCS, FACES, ROLES, SPHERE
 from robocal_ros.hand_eye.tracker_data import Arc
-from robocal_ros.history.history_records import UNDONE
+from robocal_ros.history.history_records import void
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.kinematics.robots import read_fields, read_pose
@@ -353,17 +353,14 @@ def read_mount(path: Path, *, accepted: bool = False) -> SensorMount:
     """Read a sensor's place.
 
     ``accepted``: refuse a result whose verdict does not accept it, or that the history tells to be
-    rejected or rolled back.
+    `void`.
 
     Raises `InputError`, naming file and key, when the place is missing, given twice or no pose.
     """
     top = read_fields(path, "mount file")
     if "document" in top.values:  # as the history shows it
-        if accepted and "calibration" in top.values:
-            state = top.below("calibration").text("state")
-            if state in UNDONE:
-                words = f"was {state.replace('_', ' ')}: export one that is in force"
-                top.fail(words, "calibration")
+        if accepted and (words := void(top.values)):
+            top.fail(words, "calibration")
         top = top.below("document")
     if "error" in top.values:
         top.fail("tells why no sensor was placed: calibrate again", "error")

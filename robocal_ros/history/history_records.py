@@ -79,8 +79,15 @@ class CalibrationState(StrEnum):
     """Was in force until it was rolled back."""
 
 
-UNDONE = (CalibrationState.REJECTED, CalibrationState.ROLLED_BACK)
-"""By a person, whatever its own verdict is."""
+def void(shown: Mapping[str, Any]) -> str:
+    """Why what ``robocal history show`` printed must not be used; empty: it may, or is no such."""
+    told = shown.get("calibration")
+    state = told.get("state") if isinstance(told, Mapping) else None
+    if state not in (
+        CalibrationState.REFUSED, CalibrationState.REJECTED, CalibrationState.ROLLED_BACK
+    ):  # fmt: skip
+        return ""
+    return f"was {str(state).replace('_', ' ')}: take one that is in force"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -175,6 +175,12 @@ def test_the_model_is_a_robot_file_a_shown_calibration_or_the_one_in_force(folde
     shown = {"model": model_document(ACTUAL), "document": {}}
     (folder / "shown.json").write_text(json.dumps(shown))
     _, of_json = command(capsys, "weld.dat", "--model", "shown.json", *KNOWN)
+    (folder / "undone.json").write_text(
+        json.dumps(shown | {"calibration": {"id": 3, "state": "rolled_back"}})
+    )
+    status, undone = command(capsys, "weld.dat", "--model", "undone.json", *KNOWN)
+    assert status == 2
+    assert "the calibration was rolled back" in undone["error"]["message"]
     same = dict(model_hash=NOMINAL.model_hash, model=model_document(ACTUAL), based_on=0)
     in_force = ("weld.dat", "--robot-serial", SERIAL, "--state", "state", *KNOWN)
     with CalibrationHistory.open(

@@ -226,17 +226,22 @@ def test_the_history_of_the_replay_can_be_kept(bag, tmp_path):
     listed = robocal_json("history.list.json", "history", "list", "--state", tmp_path)
     kinds = {entry["kind"] for entry in listed["calibrations"]}
     assert kinds == {f"hand_eye/{FRAME}"}
+    # What the history shows is exported to a robot description.
+    file = tmp_path / "laser.json"
+
+    def exported():
+        shown = robocal("history", "show", "1", "--state", tmp_path, "--json")
+        file.write_text(shown.stdout)
+        return robocal("hand-eye", "export", "--result", file, "--format", "urdf", "--child", FRAME)
+
+    export = exported()
+    x, y, z = (float(v) for v in export.stdout.partition('xyz="')[2].partition('"')[0].split())
+    assert 1e3 * np.array([x, y, z]) == pytest.approx(found, abs=1e-4)
     back = robocal("history", "rollback", "--kind", f"hand_eye/{FRAME}", "--to", "nominal",
                    "--state", tmp_path, "--by", "me", "--reason", "another sensor")  # fmt: skip
     assert back.returncode == 0, back.stderr
     assert f"nothing is in force again, as hand_eye/{FRAME} revision 2" in back.stdout.lower()
-    # What the history shows is exported to a robot description.
-    shown = robocal("history", "show", "1", "--state", tmp_path, "--json")
-    file = tmp_path / "laser.json"
-    file.write_text(shown.stdout)
-    export = robocal("hand-eye", "export", "--result", file, "--format", "urdf", "--child", FRAME)
-    x, y, z = (float(v) for v in export.stdout.partition('xyz="')[2].partition('"')[0].split())
-    assert 1e3 * np.array([x, y, z]) == pytest.approx(found, abs=1e-4)
+    assert "calibration was rolled back" in exported().stderr
     unknown = robocal("history", "rollback", "--kind", "hand_eye/", "--state", tmp_path)
     assert unknown.returncode == 2
     assert "none of thermal, reference" in unknown.stderr

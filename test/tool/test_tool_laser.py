@@ -285,7 +285,7 @@ def test_there_must_be_a_file(path):
         ),
         (
             {"calibration": {"state": "rolled_back"}, "document": {"tcp_mm": [1, 2, 3]}},
-            "calibration was rolled back: export one that is in force",
+            "calibration was rolled back: take one that is in force",
         ),
     ],
 )
