@@ -26,6 +26,7 @@ from robocal_ros.ground.files import quoted, read_text, write_text
 from robocal_ros.ground.frames import Array, log_rotation, transform_document
 from robocal_ros.identification.known_model import KnownModel, known_model
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import random_postures
 from robocal_ros.kinematics.robots import load_yaml, save_robot
 from robocal_ros.kinematics.tables import read_joints
 from robocal_ros.kinematics.universal_robots import (
@@ -429,9 +430,7 @@ def _document(
 
     Of an element of its pose, mm, or its like in rad at a metre.
     """
-    low = np.where(np.isfinite(arm.lower), arm.lower, np.minimum(arm.upper - 1.0, -np.pi))
-    high = np.where(np.isfinite(arm.upper), arm.upper, np.maximum(arm.lower + 1.0, np.pi))
-    q = np.random.default_rng(0).uniform(low, high, (_POSES, arm.n))
+    q = random_postures(arm, _POSES)
     there = np.array([links.fk(row) @ T_tip_flange for row in q])
     return {
         "robot": arm.name,

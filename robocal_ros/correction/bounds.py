@@ -52,7 +52,7 @@ from robocal_ros.correction.solution import MOST_STEPS, VELOCITY_EXACT
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import payload_note
+from robocal_ros.kinematics.arm import payload_note, random_postures
 
 # What floating point adds to a value that lies on its bound.
 ROUNDING = 1e-9
@@ -62,7 +62,6 @@ DEGREE = np.pi / 180.0
 FADES_FROM = 0.8
 # What a survey looks at: +-3 sigma of the share are 5 % at most.
 POSTURES = 1000
-WITHOUT_LIMIT = np.pi  # range of a joint without limits, rad (prismatic: m)
 
 
 @dataclass(frozen=True)
@@ -147,9 +146,7 @@ class Survey:
 
 def survey(reference: SerialArm, actual: SerialArm, bounds: ShiftBounds) -> Survey:
     """Look at the correction in `POSTURES` postures over the joint range, always the same ones."""
-    lower = np.where(np.isfinite(reference.lower), reference.lower, -WITHOUT_LIMIT)
-    upper = np.where(np.isfinite(reference.upper), reference.upper, WITHOUT_LIMIT)
-    q = np.random.default_rng(0).uniform(lower, upper, (POSTURES, reference.n))
+    q = random_postures(reference, POSTURES)
     found = JointCorrection.between(reference, actual).correct(q)
     fine = bounds.hold(found)
     return Survey(

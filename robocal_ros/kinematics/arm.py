@@ -426,17 +426,21 @@ def layer_of(model: Mapping[str, Any]) -> tuple[JointFunctions | None, ArmLoad |
 _POSES = 2000  # over the joints' range, among which the largest shift is sought
 
 
-def random_postures(arm: SerialArm, count: int = 60) -> Array:
-    """The same postures (count, n) at every call, throughout the joint limits.
+def joint_spans(arm: SerialArm) -> tuple[Array, Array]:
+    """Where joints are taken to go, from (n,) to (n,), rad or m: their limits.
 
     Where a limit is not known, half a turn or half a metre takes its place: from zero, or from the
     other limit where that is farther out.
     """
-    rng = np.random.default_rng(0)
     span = np.where(arm.prismatic, 0.5, np.pi)
     lower = np.where(np.isfinite(arm.lower), arm.lower, np.minimum(-span, arm.upper - span))
     upper = np.where(np.isfinite(arm.upper), arm.upper, np.maximum(span, arm.lower + span))
-    return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
+    return lower, upper
+
+
+def random_postures(arm: SerialArm, count: int = 60) -> Array:
+    """The same postures (count, n) at every call, throughout the `joint_spans`."""
+    return np.asarray(np.random.default_rng(0).uniform(*joint_spans(arm), (count, arm.n)))
 
 
 def payload_note(arm: SerialArm, identified: ArmLoad | None, present: ArmLoad | None) -> str:

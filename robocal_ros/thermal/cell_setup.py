@@ -36,6 +36,7 @@ from robocal_ros.identification.cell_model import CellModel, linear_start
 from robocal_ros.identification.judged import require_match
 from robocal_ros.identification.solve import identify
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import joint_spans
 from robocal_ros.kinematics.robots import QUATERNION_TOLERANCE, read_made, write_made
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
 
@@ -373,9 +374,8 @@ def _reached(cell: CellModel, goals: Array, rng: np.random.Generator) -> Array:
     """Joints that bring the target to goals (m, 3), from random starts; those that arrive."""
     arm, target = cell.arm, np.zeros(len(goals), dtype=np.int64)
     margin = np.where(arm.prismatic, 0.1 * MARGIN_RAD, MARGIN_RAD)
-    span = np.where(arm.prismatic, 0.5, np.pi)
-    lower = np.where(np.isfinite(arm.lower), arm.lower + margin, -span)
-    upper = np.where(np.isfinite(arm.upper), arm.upper - margin, span)
+    lower, upper = joint_spans(arm)
+    lower, upper = lower + margin * np.isfinite(arm.lower), upper - margin * np.isfinite(arm.upper)
     q = rng.uniform(lower, upper, (len(goals), arm.n))
     lever = cell.T_flange_target[0, :3, 3]
     for _ in range(_STEPS):
