@@ -266,8 +266,8 @@ class HistoryFile:
         waits_for, since_s = "", 0.0
         while True:
             if not self._lock_now(fcntl.LOCK_SH):
-                most_s = MAKING_S
-                why = f"another process has been making it, or setting it aside, for {MAKING_S:g} s"
+                most_s = MAKING_S if self._owner else self._timeout_s
+                why = f"another process has been making it, or setting it aside, for {most_s:g} s"
             elif self._sound(verify):
                 break
             elif self._lock_now(fcntl.LOCK_EX):
