@@ -536,6 +536,12 @@ def run_station(args: argparse.Namespace) -> CliResult:
         "warnings": warnings,
     }
     if args.output is not None:
+        newest = kept[-1][0]
+        if newest.code not in (Code.ACCEPT, Code.STATION_MOVED):
+            words = (
+                f"the last measurement, calibration {newest.id}, is {newest.code.name}: repeat it"
+            )
+            raise InputError(f"{words}; no laser file is written from it", file=path)
         station, arm = document["station"], robot.arm
         write_laser(
             args.output,

@@ -317,6 +317,20 @@ def test_a_station_is_commissioned_and_followed(driver, tmp_path):
     assert np.linalg.norm(off) < 4.0 * placed.laser.sigma_m
 
 
+def test_no_laser_file_is_written_from_what_proves_nothing(driver, tmp_path):
+    config = driver.session.config
+    strict = replace(config, limits=replace(config.limits, sigma_m=1e-9))
+    driver.session = ToolSession(driver.cell.arm, driver.history, strict, "test")
+    found = driver.measure("laser", cycle_id="c1")
+    assert found.status is Code.RESIDUAL_TOO_LARGE
+    document = robocal_json(
+        "error.json", "tool", "station", "--robot", "ur10", "--robot-serial", "K1",
+        "--state", tmp_path, "--output", tmp_path / "laser.yaml", status=2,
+    )  # fmt: skip
+    assert f"calibration {found.calibration_id}, is RESIDUAL" in document["error"]["message"]
+    assert not (tmp_path / "laser.yaml").exists()
+
+
 @pytest.mark.parametrize(("turn_deg", "code"), [(0.05, Code.ACCEPT), (0.5, Code.STATION_MOVED)])
 def test_a_station_that_only_turned_has_moved_too(driver, turn_deg, code):
     """As a full run of the tool says; a turn as small as a warm robot's does not matter."""
