@@ -266,7 +266,10 @@ def test_while_two_plcs_write_the_gap_is_closed(line):
 
 def test_beams_that_the_plc_writes_become_events_at_their_own_time(line):
     line.edges.clear()
-    at = datetime.now(UTC).replace(microsecond=123000)
+
+    def now() -> datetime:  # a second later it is another one's clock
+        found = datetime.now(UTC)
+        return found.replace(microsecond=found.microsecond // 1000 * 1000)
 
     def write(blocked: bool, when: datetime | None) -> None:
         value = ua.Variant(blocked, ua.VariantType.Boolean)
@@ -281,22 +284,23 @@ def test_beams_that_the_plc_writes_become_events_at_their_own_time(line):
         for status in await line.plc.client.write_values(nodes, values, False):
             status.check()
 
-    ms = timedelta(milliseconds=1)
+    ms, at = timedelta(milliseconds=1), now()
     write(False, at)
     write(True, at + 20 * ms)
     write(False, at + 30 * ms)
     assert refused(lambda: write(True, at)) == "BadInvalidTimestamp"  # out of order
     assert refused(lambda: write(True, None)) == "BadInvalidTimestamp"
     assert refused(lambda: write(True, at + timedelta(hours=1))) == "BadInvalidTimestamp"
-    line.do(line.plc, with_time(True, at + 40 * ms))
-    line.do(line.plc, with_time(False, at + 50 * ms))
+    later = now()
+    line.do(line.plc, with_time(True, later))
+    line.do(line.plc, with_time(False, later + 10 * ms))
     line.graph.spin_until(lambda: len(line.edges) == 3, "three edges")
     found = [
         (e.beam, e.edge, e.header.stamp.sec + 1e-9 * e.header.stamp.nanosec, e.stamp_sigma_s)
         for e in line.edges
     ]
-    t = at.timestamp()
-    wanted = [("x", 1, t + 0.02, 1e-3), ("x", 2, t + 0.03, 1e-3), ("y", 2, t + 0.05, 1e-3)]
+    x, y = at.timestamp(), later.timestamp() + 0.01
+    wanted = [("x", 1, x + 0.02, 1e-3), ("x", 2, x + 0.03, 1e-3), ("y", 2, y, 1e-3)]
     for one, other in zip(found, wanted, strict=True):
         assert one[:2] == other[:2]
         assert one[2:] == pytest.approx(other[2:], abs=1e-6)
