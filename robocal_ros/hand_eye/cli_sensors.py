@@ -56,6 +56,7 @@ from robocal_ros.hand_eye.cli import (
     add_limits,
     add_robot,
     add_robot_sigma,
+    add_sensor,
     add_target,
     arm_of,
     described,
@@ -205,6 +206,9 @@ def _from_poses(args: argparse.Namespace) -> HandEyeResult:
         judges = CheckPairs(held, {name: absent[name] for name in check.names if name in absent})
         alone = {name: why for name, why in alone.items() if name not in held.names}
     settings = _settings(args, robot.joints is not None)
+    if args.robot_sigma_mm is not None:
+        words = "--robot-sigma-mm counts for images alone: positions of both sides scatter together"
+        warn([f"{words}, and by how much is found from them"])
     return calibrate_camera(pairs, settings, check=judges, rejected=alone)
 
 
@@ -365,7 +369,7 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
         help="of the tracker: role (arc_a, arc_b, sphere, face_1, face_2), x_mm, y_mm, z_mm, and "
         "on the arcs the joints",
     )
-    add_description(parser)
+    add_sensor(parser)
     target = parser.add_mutually_exclusive_group(required=True)
     target.add_argument("--target", type=Path, metavar="YAML", help="radii and reflector's height")
     target.add_argument(
@@ -528,8 +532,14 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
     told = {name: value for name, value in told.items() if value is not None}
     if len({"near_mm", "far_mm"} & set(told)) == 1:
         raise InputError("give both --near-mm and --far-mm, or none")
-    usual = (value for value, _ in SENSOR.values())
-    sensor = replace(described(args), **told).seen_range(*usual)
+    usual, description = (value for value, _ in SENSOR.values()), described(args)
+    if args.sensor and "near_mm" in told and (args.near_mm > args.far_mm) != description.towards:
+        way = "towards" if description.towards else "away from"
+        raise InputError(
+            f"--near-mm {args.near_mm:g} to --far-mm {args.far_mm:g}: z of {args.sensor} grows "
+            f"{way} it, exchange the two"
+        )
+    sensor = replace(description, **told).seen_range(*usual)
     if not 0.0 < abs(sensor.near_m - sensor.far_m) < FARTHEST_MM * 1e-3:
         raise InputError(f"--near-mm {sensor.near_m * 1e3:g} is --far-mm: the field has no depth")
     known = given_target(args.target_kind, args.target, args.radius_mm)

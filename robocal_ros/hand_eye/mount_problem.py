@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array, Index
-from robocal_ros.hand_eye.result import AIM_M, ARM_M, PoseNoise
+from robocal_ros.hand_eye.result import ARM_M, PoseNoise
 
 SAME = 2e-4  # m, and rad: readings of a robot at rest differ by less, poses on purpose by more
 COMPONENTS = 3  # of every sighting; a model with fewer leaves the last ones empty
@@ -34,7 +34,7 @@ SENSOR_UNKNOWNS = ("sensor x", "sensor y", "sensor z", "turn x", "turn y", "turn
 EQUATOR = 0.995  # share of the radius beyond which the circle's radius goes on straight
 FLATTEST = 0.02  # sine of the angle between edge and laser plane below which nothing is seen
 
-FIRST_NOISE = PoseNoise(5e-5, 5e-5 / ARM_M, AIM_M, 2e-5)
+FIRST_NOISE = PoseNoise(5e-5, 5e-5 / ARM_M, 1e-4, 2e-5)
 NOISE_RANGE_M = (1e-6, 1e-2)
 FLAT = 0.02  # slope of the likelihood: a hundredth of the noise's own uncertainty
 NEAR = 0.2  # relative step in which the likelihood's bend is seen

@@ -110,22 +110,24 @@ def check_plan(
     ``noise``: of poses, and of light that is laid by eye; None: that of a good robot. ``limit_m``:
     largest expected error (rms) of a point at the working distance.
     """
+    fewest = target.fewest - (target.for_noise if noise is not None else 0)
     noise = noise or PoseNoise(ROBOT_SIGMA_M, 0.0, AIM_M)
     sensor, place = target.sensor, target.place(T_base_flange @ T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
     whole = target.view(T_base_flange, T_flange_sensor, place)
     unseen = target.unseen(whole)
     rows = ~np.isin(whole.sightings.shot, list(unseen))
-    seen = len(T_base_flange) - len(unseen)
+    looking = np.delete(T_base_flange, list(unseen), axis=0)
+    seen = len(set(same_pose(looking).tolist())) if len(looking) else 0
     rank, information, covariance, words = _shown(whole.take(rows), state, noise, sensor)
     sigma = error = None
     if covariance is not None:
         sigma = np.sqrt(np.diag(at_origin(covariance, sensor.pivot)))
         error = float(expected_error_m(covariance, sensor.field_points - sensor.pivot))
-    verdict = _verdict(seen, target.fewest, words, error, limit_m)
+    verdict = _verdict(seen, fewest, words, error, limit_m)
     proposed, better = np.empty((0, 4, 4)), None
     if not verdict.accept:
-        wanted = target.fewest + SPARE_POSES - seen
+        wanted = fewest + SPARE_POSES - seen
         proposed, better = _propose(
             target, T_base_flange, state, information, noise, limit_m, wanted
         )
@@ -161,7 +163,7 @@ def _verdict(
 ) -> Verdict:
     open_ones = f"not determined: {joined(words)}" if words else ""
     if seen < fewest:
-        few = f"{seen} poses see the target, at least {fewest} are needed"
+        few = f"{seen} poses that differ see the target, at least {fewest} are needed"
         return Verdict(Code.TOO_FEW_SAMPLES, "; ".join(filter(None, (few, open_ones))))
     if words or error is None:
         return Verdict(Code.RANK_DEFICIENT, open_ones)
@@ -302,15 +304,17 @@ class PlannedSphere:
     """A sphere; ``centre`` (3,) in base, or None: where most poses see it.
 
     As each planned target it tells which ``sensor`` looks, how many poses are the ``fewest`` to
-    solve anything, its ``place`` by sensor poses (m, 4, 4) that look at it, the ``view`` to expect
-    from flange poses (m, 4, 4), from which poses it is ``unseen``, and why, and ``candidates``
-    (n, 4, 4): sensor poses that see it well, turned about those that are planned.
+    solve anything, so many of these ``for_noise`` of the robot, where that is not given, its
+    ``place`` by sensor poses (m, 4, 4) that look at it, the ``view`` to expect from flange poses
+    (m, 4, 4), from which poses it is ``unseen``, and why, and ``candidates`` (n, 4, 4): sensor
+    poses that see it well, turned about those that are planned.
     """
 
     radius_m: float
     sensor: SensorRange
     centre: Sequence[float] | None = None
     fewest: int = field(default=FEWEST_SPHERES, init=False)
+    for_noise: int = field(default=0, init=False)
 
     def place(self, T_base_sensor: Array) -> Array:
         """Its centre."""
@@ -361,6 +365,7 @@ class PlannedLine:
 
     sensor: SensorRange
     line: Array | None = None
+    for_noise: int = field(default=1, init=False)
 
     @property
     def fewest(self) -> int:
@@ -408,6 +413,7 @@ class PlannedStairs:
     sensor: SensorRange
     marks: Sequence[str] | None = None
     fewest: int = field(default=4, init=False)
+    for_noise: int = field(default=1, init=False)
 
     def __post_init__(self) -> None:
         self.target.require_marks(self.marks or ())
@@ -623,6 +629,14 @@ def sphere_centre(
     return task.placed(view, T_flange_sensor) if len(view.sightings.names) >= FEWEST_SEEN else None
 
 
+def laser_target(data: DataSet) -> LaserTarget | None:
+    """Of a data set. Raises `InputError` where no plans are judged for what it has."""
+    target = target_of(data.target)
+    if data.kind in ("camera", POINT) or isinstance(target, BoardTarget | TrackerTarget):
+        raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
+    return target
+
+
 def judged_plan(
     data: DataSet,
     T_base_flange: Array,
@@ -646,9 +660,7 @@ def judged_plan(
         data.require_mark(mark)
     if centre is not None and data.kind != "sphere":
         raise InputError(f"center is a sphere's, not a {data.kind}'s: leave it out")
-    target = target_of(data.target)
-    if data.kind in ("camera", POINT) or isinstance(target, BoardTarget | TrackerTarget):
-        raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
+    target = laser_target(data)
     given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
     middle = None if centre is None else centre.tolist()
     planned = planned_target(target, sensor, middle, tuple(marks) or None)

@@ -35,7 +35,7 @@ METHODS: tuple[Method, ...] = ("best", "classic")
 MOST_REJECTED = 1.0 / 3.0
 LARGEST_RMS_M = 2e-3  # of samples from the target
 ARM_M = 3.0  # a turn of the flange counts as the shift that goes with it there
-AIM_M = 1e-4  # by which the eye misses a mark with the light, one sigma, where no shots tell it
+AIM_M = 2e-4  # by which the eye misses a mark with the light, one sigma, where no shots tell it
 STRIDE = 8  # of the points that tell the field of view
 OUTSIDE = 0.02  # share of points beyond it on each side: spikes
 

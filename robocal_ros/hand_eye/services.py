@@ -494,6 +494,7 @@ class HandEyeServices:
         session, settings = self._session(), self._settings
         if (data := session.data) is None:
             raise ConflictError("no data set is open: call start, so that the target is known")
+        planning.laser_target(data)  # refuses others before it asks for more
         arm, joints = session.current.arm, [joint_sample(one) for one in request.joints]
         poses = planning.planned_poses(arm, joints, [_parts(pose) for pose in request.flange])
         described = session.config.sensor

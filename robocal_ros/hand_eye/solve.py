@@ -314,11 +314,11 @@ def _too_few(fit: MountFit, settings: HandEyeSettings) -> Verdict | None:
     problem = MountProblem(fit.views, fit.noise, fit.state)
     spare = int(problem.sizes.sum()) - len(fit.covariance)
     if spare < FEWEST_SPARE:
-        words = f"only {spare} measured numbers beyond the unknowns: show it from more poses"
+        words = f"only {spare} measured numbers beyond the unknowns: more poses are needed"
         return Verdict(Code.TOO_FEW_SAMPLES, words)
     if settings.noise() is None and (told := noise_numbers(problem)) < FEWEST_TOLD:
-        words = f"{len(problem.poses)} poses leave {max(told, 0)} numbers to tell the robot's noise"
-        words += f" (at least {FEWEST_TOLD}): show the target from more poses, or give that noise"
+        words = f"too few poses, {len(problem.poses)}, to tell the robot's noise ({max(told, 0)} "
+        words += f"numbers, {FEWEST_TOLD} are needed): show the target from more poses, or give it"
         return Verdict(Code.TOO_FEW_SAMPLES, words)
     return None
 

@@ -497,6 +497,13 @@ class TestPlan:
         assert found["verdict"]["code"] == "RANK_DEFICIENT"
         assert (found["sigma"], found["working_error_mm"]) == (None, None)
 
+    def test_a_field_that_the_sensor_counts_the_other_way_is_refused(self, made, mount, tmp_path):
+        poses = write_part(tmp_path, "poses", shots_of("sphere"), range(SHOTS))
+        for sensor, near_mm, far_mm in (("wenglor", 10, -10), ("keyence", 190, 210)):
+            field = ["--near-mm", near_mm, "--far-mm", far_mm, "--sensor", sensor]
+            found = robocal(*self.plan("sphere", poses, mount, *self.centre(), *field), status=2)
+            assert f"z of {sensor} grows" in found["error"]["message"]
+
     def test_poses_out_of_range_are_named(self, made, mount, tmp_path):
         some = shots_of("sphere")
         T = some.T_base_flange[:SHOTS].copy()
@@ -597,10 +604,10 @@ class TestVerify:
         """As ``robocal history show --json`` tells it: the verdict alone accepts it for ever."""
         document = json.loads(result.read_text())
         run = ["export", "--result", result, "--format", "urdf"]
-        for state, status in (("in_force", 0), ("rejected", 2), ("rolled_back", 2)):
+        for state, status in (("in_force", 0), ("rejected", 2), ("rolled_back", 2), ("refused", 2)):
             shown = {"calibration": {"id": 1, "state": state}, "document": document}
             result.write_text(json.dumps(shown))
             found = robocal(*run, status=status)
             if status:
                 told = state.replace("_", " ")
-                assert f"calibration was {told}: export one" in found["error"]["message"]
+                assert f"calibration was {told}: take one" in found["error"]["message"]

@@ -98,7 +98,7 @@ def test_light_is_laid_on_marks_by_eye():
     """Along the edges, nearly the laser plane's normal, it is what a calm robot's shots err by."""
     calm = PoseRobot(2e-5, 2e-5)
     rng = np.random.default_rng(5)
-    shots = step_shots(replace(CELL, robot=calm), STAIRS, 16, rng, aim_m=1e-4)
+    shots = step_shots(replace(CELL, robot=calm), STAIRS, 16, rng)
     settings = HandEyeSettings(calm.position_m, calm.rotation_rad)
     result = solve_task(step_task(), data_of(shots), "best", settings)
     stairs, X = PlannedStairs(stairs_target(), SENSOR, ("near", "far")), CELL.T_flange_sensor
@@ -183,6 +183,27 @@ def test_poses_without_enough_rotation_are_refused_in_words(turned):
     assert "translation" in plan.unobservable[0]
     missing = "about another axis" if turned else "about two axes"
     assert all(missing in words for words in plan.unobservable)
+
+
+def test_poses_are_counted_that_differ():
+    """From one pose the robot errs alike, however often it goes there."""
+    poses = sphere_poses(4)
+    plan = judged(BALL, np.concatenate([poses, poses]))
+    assert plan.verdict.code is Code.TOO_FEW_SAMPLES
+    assert plan.verdict.reason.startswith("4 poses that differ see the target")
+
+
+@pytest.mark.parametrize(("known", "fewest"), [(False, 7), (True, 5)])
+def test_noise_that_is_given_needs_no_pose_to_tell_it(known, fewest):
+    line = np.stack([T_BASE_USER[:3, 3], T_BASE_USER[:3, 0]])
+    target = PlannedLine(SENSOR, line if known else None)
+    shots = edge_shots(CELL, T_BASE_USER, fewest, np.random.default_rng(1))
+    codes = [
+        check_plan(target, shots.true_T_base_flange, CELL.T_flange_sensor, noise, 1.0).verdict.code
+        for noise in (NOISE, None)
+    ]
+    assert codes[0] is not Code.TOO_FEW_SAMPLES
+    assert codes[1] is Code.TOO_FEW_SAMPLES
 
 
 def test_too_few_poses():

@@ -239,6 +239,13 @@ class TestStep:
         assert chi_square(found, TRUE) < FAR_OFF
         assert np.trace(found.covariance[:3, :3]) > 2.0 * np.trace(exact.covariance[:3, :3])
 
+    def test_of_a_calm_robot_light_is_laid_on_marks_by_eye_all_the_same(self):
+        known = stairs_target(user_sigma_m=2e-4, user_sigma_rad=1e-3)
+        calm = replace(CELL, robot=PoseRobot(2e-5, 2e-5))
+        data = data_of(step_shots(calm, STAIRS, 10, np.random.default_rng(8)))
+        found = verify(step_task(known), data, TRUE, HandEyeSettings(2e-5, 2e-5))
+        assert not found.rejected
+
     def test_classic_has_nine_unknowns_and_a_right_handed_frame(self):
         """Exact corners give the sensor; r2 = r3 x r1 of such that are off is no mirror image."""
         rng = np.random.default_rng(12)
