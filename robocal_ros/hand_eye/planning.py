@@ -630,7 +630,7 @@ def sphere_centre(
 
 
 def laser_target(data: DataSet) -> LaserTarget | None:
-    """Of a data set. Raises `InputError` where no plans are judged for what it has."""
+    """What a line laser is shown. Raises `InputError` for what no plans are judged for."""
     target = target_of(data.target)
     if data.kind in ("camera", POINT) or isinstance(target, BoardTarget | TrackerTarget):
         raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
