@@ -4,12 +4,14 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
 from maintenance_live import LiveCell
 from robocal_msgs.msg import AccuracyState, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, GetMaintenance, RunMaintenanceCycle
 
 from robocal_ros.ground.errors import Code
 
+pytestmark = pytest.mark.cell
 GAP_S = 150.0
 
 

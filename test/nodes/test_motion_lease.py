@@ -95,6 +95,7 @@ TRIGGERS = {
 }
 
 
+@pytest.mark.cell
 def test_the_program_waits_while_the_cell_measures_and_calls_do_not(
     graph: Any, tmp_path: Path
 ) -> None:
