@@ -30,7 +30,7 @@ from robocal_ros.ground.files import read_bytes, read_text, write_bytes
 from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
-from robocal_ros.history.history_records import THERMAL, void
+from robocal_ros.history.history_records import THERMAL, why_void
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import ALPHA, BETA, THETA, arm_of, layer_of, payload_note
 from robocal_ros.kinematics.joint_functions import ArmLoad
@@ -177,8 +177,8 @@ def read_model(
     ``path``: a robot file, or a document with a ``model``. ``in_use``: what the robot is to be
     corrected with, which no person may have undone.
 
-    Raises `InputError` when it is neither, or `void`; `WrongRobotError` for other joints than the
-    nominal's.
+    Raises `InputError` when it is neither, or void (`why_void`); `WrongRobotError` for other joints
+    than the nominal's.
     """
     if path.suffix == ".json":
         try:
@@ -188,7 +188,7 @@ def read_model(
             _, identified = layer_of(model)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"holds no model: {error!r}", file=str(path)) from error
-        if in_use and (words := void(document)):
+        if in_use and (words := why_void(document)):
             raise InputError(f"the calibration {words}", file=str(path))
     else:
         arm = describe_robot(str(path))[0].arm

@@ -532,14 +532,12 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
     told = {name: value for name, value in told.items() if value is not None}
     if len({"near_mm", "far_mm"} & set(told)) == 1:
         raise InputError("give both --near-mm and --far-mm, or none")
-    usual, description = (value for value, _ in SENSOR.values()), described(args)
-    if args.sensor and "near_mm" in told and (args.near_mm > args.far_mm) != description.towards:
-        way = "towards" if description.towards else "away from"
-        raise InputError(
-            f"--near-mm {args.near_mm:g} to --far-mm {args.far_mm:g}: z of {args.sensor} grows "
-            f"{way} it, exchange the two"
-        )
-    sensor = replace(description, **told).seen_range(*usual)
+    usual = {f"{name}_mm": value for name, (value, _) in SENSOR.items()}
+    replaced: dict[str, Any] = dict.fromkeys(told)  # what the options tell counts before a file
+    description = replace(described(args), **replaced)
+    if "near_mm" in told and args.near_mm > args.far_mm and not args.sensor:
+        description = replace(description, z_grows="towards")  # nothing else says it
+    sensor = description.seen_range(**usual | told)
     if not 0.0 < abs(sensor.near_m - sensor.far_m) < FARTHEST_MM * 1e-3:
         raise InputError(f"--near-mm {sensor.near_m * 1e3:g} is --far-mm: the field has no depth")
     known = given_target(args.target_kind, args.target, args.radius_mm)

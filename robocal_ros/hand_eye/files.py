@@ -34,7 +34,7 @@ from robocal_ros.hand_eye.profiles import (
 )
 from robocal_ros.hand_eye.targets import ARCS, FACES, ROLES, SPHERE
 from robocal_ros.hand_eye.tracker_data import Arc
-from robocal_ros.history.history_records import void
+from robocal_ros.history.history_records import why_void
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.kinematics.robots import read_fields, read_pose
@@ -352,14 +352,14 @@ class SensorMount:
 def read_mount(path: Path, *, accepted: bool = False) -> SensorMount:
     """Read a sensor's place.
 
-    ``accepted``: refuse a result whose verdict does not accept it, or that the history tells to be
-    `void`.
+    ``accepted``: refuse a result whose verdict does not accept it, or that is void
+    (`why_void`).
 
     Raises `InputError`, naming file and key, when the place is missing, given twice or no pose.
     """
     top = read_fields(path, "mount file")
     if "document" in top.values:  # as the history shows it
-        if accepted and (words := void(top.values)):
+        if accepted and (words := why_void(top.values)):
             top.fail(words, "calibration")
         top = top.below("document")
     if "error" in top.values:

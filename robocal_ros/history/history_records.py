@@ -79,7 +79,7 @@ class CalibrationState(StrEnum):
     """Was in force until it was rolled back."""
 
 
-def void(shown: Mapping[str, Any]) -> str:
+def why_void(shown: Mapping[str, Any]) -> str:
     """Why what ``robocal history show`` printed must not be used; empty: it may, or is no such."""
     told = shown.get("calibration")
     state = told.get("state") if isinstance(told, Mapping) else None

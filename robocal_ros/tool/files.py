@@ -12,7 +12,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import Array, Document, urdf_joint, urdf_origin
-from robocal_ros.history.history_records import void
+from robocal_ros.history.history_records import why_void
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import QUATERNION_TOLERANCE, read_fields
 from robocal_ros.kinematics.tables import (
@@ -51,12 +51,12 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
     one takes none. As the history shows it the tool has the one that it comes into force with.
 
     Raises `InputError`, naming file and key, when one of them is missing, null or no measurement,
-    and when the document's verdict does not accept the tool, or the history tells it to be `void`.
+    and when the document's verdict does not accept the tool, or it is void (`why_void`).
     """
     top = read_fields(path, "tool file")
     kept = top.below("model") if {"document", "model"} <= top.values.keys() else None
     if "document" in top.values:  # as the history shows it
-        if words := void(top.values):
+        if words := why_void(top.values):
             top.fail(words, "calibration")
         top = top.below("document")
     if "error" in top.values:

@@ -497,12 +497,18 @@ class TestPlan:
         assert found["verdict"]["code"] == "RANK_DEFICIENT"
         assert (found["sigma"], found["working_error_mm"]) == (None, None)
 
-    def test_a_field_that_the_sensor_counts_the_other_way_is_refused(self, made, mount, tmp_path):
+    def test_the_field_is_counted_as_the_sensor_counts(self, made, mount, tmp_path):
+        """As hand_eye_node does: distances of one that tells heights are from the middle."""
         poses = write_part(tmp_path, "poses", shots_of("sphere"), range(SHOTS))
-        for sensor, near_mm, far_mm in (("wenglor", 10, -10), ("keyence", 190, 210)):
+
+        def plan(sensor, near_mm, far_mm, status=0):
             field = ["--near-mm", near_mm, "--far-mm", far_mm, "--sensor", sensor]
-            found = robocal(*self.plan("sphere", poses, mount, *self.centre(), *field), status=2)
-            assert f"z of {sensor} grows" in found["error"]["message"]
+            run = self.plan("sphere", poses, mount, *self.centre(), *field)
+            return robocal(*run, status=status)
+
+        refused = plan("wenglor", 10, -10, status=2)["error"]["message"]
+        assert "from 10 to -10 mm, but its z grows away from it" in refused
+        assert plan("keyence", 190, 210) == plan("keyence", 10, -10)
 
     def test_poses_out_of_range_are_named(self, made, mount, tmp_path):
         some = shots_of("sphere")

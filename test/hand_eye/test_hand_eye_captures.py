@@ -94,13 +94,19 @@ def test_a_shot_that_is_stamped_before_the_call_is_told_as_that(history):
     assert "profile is stamped 0.200 s before the call" in failed.reason
 
 
-def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkeypatch):
-    driver = begun(history)
-    read = []
+@pytest.fixture
+def read(monkeypatch):
+    """Messages whose profiles were read."""
+    found = []
     points = hand_eye_data.cloud_profile
     monkeypatch.setattr(
-        hand_eye_data, "cloud_profile", lambda m, sensor: read.append(m) or points(m, sensor)
+        hand_eye_data, "cloud_profile", lambda m, sensor: found.append(m) or points(m, sensor)
     )
+    return found
+
+
+def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, read):
+    driver = begun(history)
     driver.robot.rest(1.0, SHOTS[0][1])
     assert not read
     driver.ask(events.CAPTURE)
@@ -115,14 +121,9 @@ def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkey
     assert len(kept) == MOST_BYTES // 1_000_000
 
 
-def test_shots_of_a_moving_robot_are_not_read(history, monkeypatch):
+def test_shots_of_a_moving_robot_are_not_read(history, read):
     """What was read is kept with the shot: of images that is many times what came."""
     driver = begun(history)
-    read = []
-    points = hand_eye_data.cloud_profile
-    monkeypatch.setattr(
-        hand_eye_data, "cloud_profile", lambda m, sensor: read.append(m) or points(m, sensor)
-    )
     assert driver.ask(events.CAPTURE).done
     for number in (1, 0, 1, 0):
         driver.robot.move(SHOTS[number][0], 0.3)
