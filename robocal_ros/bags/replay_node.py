@@ -332,8 +332,9 @@ class ReplayNode(HouseNode):
         self._set_state(PAUSED if self.settings["start_paused"] else WAITING)
 
     def deactivate(self) -> None:
-        """Stop where it is."""
-        self._set_state(PAUSED)
+        """Stop where it is; a bag that has ended stays so, at the end of the process too."""
+        plays = self._play_state in (WAITING, PLAYING)
+        self._set_state(PAUSED if plays else self._play_state)
 
     def cleanup(self) -> None:
         """Close the bag."""
