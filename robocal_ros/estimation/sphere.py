@@ -30,7 +30,13 @@ from robocal_ros.estimation.surfaces import (
     on_curve,
     smoothed,
 )
-from robocal_ros.ground.errors import InputError, ResidualError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import (
+    InputError,
+    RankDeficientError,
+    ResidualError,
+    RobocalError,
+    TooFewSamplesError,
+)
 from robocal_ros.ground.frames import Array, Mask
 from robocal_ros.ground.samples import (
     DEFAULT_TARGET,
@@ -413,6 +419,7 @@ FEWEST_ON_CAP = 30
 # How many triples are tried, and how many points complete and judge them: first in haste, then,
 # where that finds nothing, for a sphere among much else.
 _EFFORTS = ((100, 150), (400, 400))
+_THIN = 1e-3  # of the radius: points that leave a plane by less, rms, lie in it
 _REACH = 1.5  # radii between the points of a triple
 _NEAR_CAP_M = 3e-4  # a start is judged by the points so near to it
 _ROUNDS = 12
@@ -463,15 +470,22 @@ def fit_sphere(points: Array, rule: SphereRule) -> SphereFit:
 
     The same cloud always gives the same answer: the starts are drawn with a fixed seed.
 
-    Raises `TooFewSamplesError`: fewer than 30 finite points on a sphere; `ResidualError`: a wrong
-    radius, too much noise, or a cap too small for a centre that is known well enough: the message
-    holds the figure that failed and its limit.
+    Raises `TooFewSamplesError`: fewer than 30 finite points on a sphere; `RankDeficientError`:
+    points of one plane; `ResidualError`: a wrong radius, too much noise, or a cap too small for a
+    centre that is known well enough: the message holds the figure that failed and its limit.
     """
     finite = np.all(np.isfinite(points), axis=1)
     cloud = np.ascontiguousarray(points[finite], dtype=np.float64)
     if len(cloud) < FEWEST_ON_CAP:
         raise TooFewSamplesError(
             f"{len(cloud)} points give no sphere's centre: at least {FEWEST_ON_CAP} are needed"
+        )
+    thin, wide, _ = np.linalg.eigvalsh(np.cov(cloud.T))
+    if thin < (_THIN * rule.radius_m) ** 2 < wide:
+        raise RankDeficientError(
+            "the points lie in one plane, and do not tell a sphere's centre: send a cap, as an "
+            "area scanner sees it; profiles of a line laser are for hand_eye_node",
+            ("the centre, across that plane",),
         )
     for triples, judges in _EFFORTS:
         try:
@@ -624,8 +638,8 @@ def cloud_sample(
 ) -> PointSample:
     """Build a sample of a sphere's centre from a ``sensor_msgs/PointCloud2`` of its cap.
 
-    Raises `InputError`, `TooFewSamplesError` or `ResidualError` when the message is no cloud, or
-    holds no sphere as the rule wants it.
+    Raises `InputError` when the message is no cloud; as `fit_sphere` when it holds no sphere as the
+    rule wants it.
     """
     frame, target = frame_and_target(message.header.frame_id, default_target)
     fit = fit_sphere(cloud_points(message), rule)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from robocal_ros.cell_sim.sensors import CloudScene, sphere_cloud
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
+from robocal_ros.ground.errors import RankDeficientError, ResidualError, TooFewSamplesError
 
 RADIUS = 0.01905
 RULE = SphereRule(RADIUS)
@@ -122,3 +122,14 @@ def test_a_centre_known_too_badly_is_refused():
 def test_what_is_no_sphere_is_said(cloud, words):
     with pytest.raises(TooFewSamplesError, match=words):
         fit_sphere(cloud, RULE)
+
+
+def test_a_profile_of_a_line_laser_is_no_cap():
+    """Its circle is of the sphere, which lies on either side: no radius is wrong there."""
+    x = np.linspace(-0.01, 0.01, 400)
+    depth = np.sqrt(RADIUS**2 - 0.009**2 - x**2) + 2e-5 * rng(7).standard_normal(len(x))
+    profile = np.column_stack([x, 0.0 * x, 0.2 - depth])
+    turned = profile @ frames.exp_rotation([0.3, -1.0, 0.5]).T + CENTRE
+    for cloud in (profile, turned.astype(np.float32)):
+        with pytest.raises(RankDeficientError, match=r"lie in one plane.*for hand_eye_node"):
+            fit_sphere(cloud, RULE)
