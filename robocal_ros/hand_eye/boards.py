@@ -313,10 +313,14 @@ class SeenBoards:
 
 
 def see_boards(
-    images: Sequence[tuple[str, Image]], board: Chessboard, intrinsics: Intrinsics | None = None
-) -> SeenBoards:
-    """Find the board in named images, and the intrinsics from the same images if none are given."""
-    rejected: dict[str, str] = {}
+    images: Sequence[tuple[str, Image]], board: Chessboard, intrinsics: Intrinsics | None = None,
+    unread: dict[str, str] | None = None,
+) -> SeenBoards:  # fmt: skip
+    """Find the board in named images, and the intrinsics from the same images if none are given.
+
+    ``unread``: name of each image that cannot be read, with the reason.
+    """
+    rejected = dict(unread or {})
     sizes = [(image.shape[1], image.shape[0]) for _, image in images]
     size = intrinsics.size if intrinsics else max(sizes, key=sizes.count, default=(0, 0))
     names, corners = [], []

@@ -171,11 +171,11 @@ def _pairs_of_images(
 ) -> tuple[PosePairs, SeenBoards]:  # fmt: skip
 
     images, unread = read_images(args.profiles, table)
-    seen = see_boards(images, board, intrinsics)
+    seen = see_boards(images, board, intrinsics, unread)
     pairs = board_pairs(
         seen, board, table.names, table.T_base_flange, args.mount, table.joints, beside
     )
-    return pairs, replace(seen, rejected=unread | seen.rejected)
+    return pairs, seen
 
 
 def _from_poses(args: argparse.Namespace) -> HandEyeResult:

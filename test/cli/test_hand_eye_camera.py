@@ -254,6 +254,17 @@ def test_an_image_that_is_none_is_left_out(robocal, folder: Path) -> None:
     assert "no image" in document["rejected_because"]["shot0.png"]
 
 
+def test_where_none_can_be_read_it_is_said_why_no_image_shows_the_board(
+    robocal, folder: Path, tmp_path: Path
+) -> None:
+    for image in (folder / "images").iterdir():
+        (tmp_path / image.name).write_bytes(b"not an image")
+    document = robocal("--poses", "image_poses.csv", "--images", tmp_path, *BOARD, status=3)
+    words = document["error"]["message"]
+    assert words.startswith("0 images show the board (at least 5 are needed")
+    assert words.endswith("is no image that can be read")
+
+
 def test_people_read_it_too(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables = [str(folder / name) for name in ("stream_poses.csv", "stream_boards.csv")]
     assert main(["hand-eye", "camera", "--poses", tables[0], "--measured", tables[1]]) == 0
