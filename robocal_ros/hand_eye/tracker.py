@@ -23,6 +23,7 @@ from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.mount_problem import from_plane, moved, tangents
 from robocal_ros.hand_eye.result import (
+    MOST_REJECTED,
     HandEyeResult,
     Method,
     PoseRows,
@@ -447,18 +448,18 @@ def misfit(estimate: Estimate[TrackerUnknowns]) -> float:
 
 def judge_tracker(estimate: Estimate[TrackerUnknowns], working_m: float, limit_m: float) -> Verdict:
     """Whether a solution may be used; ``working_m``: error to expect at the working distance."""
-    over = misfit(estimate)
+    over, lost, rows = misfit(estimate), int(estimate.rejected.sum()), len(estimate.rejected)
     what = (
         f"{working_m * 1e3:.3f} mm rms to expect at the working distance (allowed "
         f"{limit_m * 1e3:.3f}), residuals {over:.2f} times the noise"
     )
     if not estimate.converged:
         return Verdict(Code.POSES_NOT_INFORMATIVE, f"{estimate.creeping}; {what}")
-    if over > LARGEST_SCALE:
+    if over > LARGEST_SCALE or lost > MOST_REJECTED * rows:
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
-            f"{what}: check the robot file, the noise that was given, and that tracker, base and "
-            "target stood still",
+            f"{what}, {lost} of {rows} numbers left out: check the robot file, the noise that was "
+            "given, and that tracker, base and target stood still",
         )
     if working_m > limit_m:
         return Verdict(

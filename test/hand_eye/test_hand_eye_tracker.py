@@ -24,6 +24,7 @@ from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.tracker import (
     SENSOR,
     UNKNOWNS,
+    judge_tracker,
     solve_best,
     solve_tracker,
     states_without,
@@ -529,6 +530,16 @@ def test_noise_far_above_what_was_told_is_refused():
     told = replace(made.sizes.noise, joint_m=2e-7, joint_rad=5e-7, tracker_m=5e-6)
     found = solve_tracker(noisy(), made.sizes.target, told)
     assert found.verdict.code.name == "RESIDUAL_TOO_LARGE"
+
+
+@pytest.mark.parametrize(("kept_of_ten", "code"), [(7, "ACCEPT"), (6, "RESIDUAL_TOO_LARGE")])
+def test_what_fits_most_of_the_numbers_alone_is_refused(kept_of_ten, code):
+    """However well it fits those."""
+    _, estimate, _ = solved()
+    rows = np.arange(len(estimate.rejected))
+    verdict = judge_tracker(replace(estimate, rejected=rows % 10 >= kept_of_ten), 1e-4, 5e-4)
+    assert verdict.code.name == code
+    assert ("numbers left out" in verdict.reason) == (code != "ACCEPT")
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1.5, np.pi - 1e-4, np.pi])
