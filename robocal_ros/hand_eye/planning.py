@@ -377,8 +377,10 @@ class PlannedLine:
         if self.line is not None:
             return self.line
         point = (T_base_sensor @ np.array([0.0, 0.0, self.sensor.middle_m, 1.0])).mean(axis=0)[:3]
-        normal = T_base_sensor[:, :3, 1].mean(axis=0)
-        return np.stack([point, normal / np.linalg.norm(normal)])
+        normals = T_base_sensor[:, :3, 1]  # turned round, the sensor sees the same edge
+        sums = np.where(normals @ normals.T < 0.0, -1.0, 1.0) @ normals
+        lengths = np.linalg.norm(sums, axis=1)
+        return np.stack([point, sums[np.argmax(lengths)] / lengths.max()])
 
     def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> TargetView:
         """Points of the edge."""

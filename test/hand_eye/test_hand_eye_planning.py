@@ -206,6 +206,17 @@ def test_noise_that_is_given_needs_no_pose_to_tell_it(known, fewest):
     assert codes[1] is Code.TOO_FEW_SAMPLES
 
 
+def test_an_unknown_edge_lies_across_the_light_whichever_way_round_the_sensor_is_held():
+    shots = edge_shots(CELL, T_BASE_USER, 8, np.random.default_rng(1))
+    T = shots.true_T_base_flange @ CELL.T_flange_sensor
+    turned = T.copy()
+    turned[::2, :3, :2] *= -1.0  # by half a turn about the beam
+    (point, along), (other_point, other) = (PlannedLine(SENSOR).place(each) for each in (T, turned))
+    assert other_point == pytest.approx(point)
+    assert abs(other @ along) == pytest.approx(1.0)
+    assert abs(along @ T_BASE_USER[:3, 0]) > np.cos(np.radians(40.0))  # one pose is off by no more
+
+
 def test_too_few_poses():
     plan = judged(BALL, sphere_poses(4))
     assert plan.verdict.code is Code.TOO_FEW_SAMPLES
