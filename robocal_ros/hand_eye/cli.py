@@ -379,9 +379,9 @@ def show_mount(console: "Console", document: Document) -> None:
     if (own := document.get("linearity")) is not None:
         console.print(
             f"The sensor's own linearity, taken out: rms {own['rms_um']:.0f} um, largest "
-            f"{own['max_um']:.0f}; profiles differ from circles by {own['residual_um']:.0f} um, "
-            f"with it {own['left_out_um']:.0f}; what is not known of it makes "
-            f"{own['working_error_mm']:.3f} mm rms in the field of view"
+            f"{own['max_um']:.0f}, its scale aside; profiles differ from circles by "
+            f"{own['residual_um']:.0f} um, with it {own['left_out_um']:.0f}; what is not known of "
+            f"it makes {own['working_error_mm']:.3f} mm rms in the field of view"
         )
     every = document.get("spread")
     if every is not None and every["n"] > len(residual["per_sample"]):

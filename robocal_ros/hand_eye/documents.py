@@ -77,11 +77,13 @@ class LinearityDocument(TypedDict):
     """Of the sensor, where it was found and taken out of the profiles."""
 
     degree: NotNegative
-    rms_um: NotNegative
-    max_um: NotNegative
+    rms_um: Annotated[NotNegative, "Of its form as the profiles alone show it, without the scale."]
+    max_um: Annotated[NotNegative, "The same."]
     residual_um: NotNegative
     left_out_um: NotNegative
-    coefficients_um: Numbers
+    coefficients_um: Annotated[
+        Numbers, "As mount and profiles together have them; the last, a scale of z, is the mount's."
+    ]
     low_mm: Two
     high_mm: Two
 

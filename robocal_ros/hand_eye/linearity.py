@@ -121,7 +121,8 @@ class SensorLinearity:
 
     ``low``, ``high`` (2,): ends of the field in x and z that profiles showed, m. ``degree``: of the
     polynomial; a shift and a turn are the mount's. ``coefficients`` (k,), ``covariance`` (k, k): of
-    products of Legendre's polynomials, and of the scale of z, m. ``rms_m``, ``max_m``: of the error
+    products of Legendre's polynomials, and of the scale of z, m, which the mount shows and moves
+    with the others. ``rms_m``, ``max_m``: of the error as curves alone tell it, without the scale,
     at the points that showed it. ``residual_m``, ``left_out_m``: rms of residuals without it, and
     with one that is found from the other profiles. ``assumed``: not seen; none is taken out, and
     ``covariance`` and ``rms_m`` are as makers state.
