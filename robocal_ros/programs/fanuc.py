@@ -8,7 +8,7 @@
         W =   180.000 deg,	P =     0.000 deg,	R =   -90.000 deg
     };
 
-Only group 1 is a robot's. Sources are in docs/programs.md.
+Group 1 is corrected; positions of others stay, and are told. Sources are in docs/programs.md.
 """
 
 import re
@@ -69,6 +69,7 @@ class FanucDialect(Dialect):
         start = begin.end() if begin else len(text)
         relative = {int(found[1]) for found in _RELATIVE.finditer(text, 0, start)}
         points: list[ProgramPoint] = []
+        others: dict[str, list[int]] = {}  # by group the lines of its points
         for found in _POINT.finditer(text, start):
             end = text.find("};", found.end())
             end = len(text) if end < 0 else end
@@ -76,10 +77,13 @@ class FanucDialect(Dialect):
             own = next((group for group in groups if group[1] == "1"), None)
             name = f"P[{found[1]}]" + (f" {found[2]}" if found[2] else "")
             line = line_of(text, found.start())
+            for other in {group[1] for group in groups} - {"1"}:
+                others.setdefault(other, []).append(line)
             if own is None:
-                continue
-            behind = [group.start() for group in groups if group.start() > own.start()]
-            point = _point(text, name, line, own.end(), min([*behind, end]))
+                point = ProgramPoint(name, line, (), problem="has no position of group 1")
+            else:
+                behind = [group.start() for group in groups if group.start() > own.start()]
+                point = _point(text, name, line, own.end(), min([*behind, end]))
             if int(found[1]) in relative:
                 point = replace(point, problem="is relative to the point before (INC)")
             points.append(replace(point, order=len(points)))
@@ -88,7 +92,12 @@ class FanucDialect(Dialect):
             (line_of(text, found.start()), " ".join(found[0].split()).rstrip(" :"))
             for found in _COMPUTED.finditer(text, 0, start)
         )
-        return Program(text, tuple(points), frames, computed)
+        notes = tuple(
+            f"group {number}: its positions stay as they are, the first of {len(lines)} in line "
+            f"{lines[0]}; group 1 alone is corrected"
+            for number, lines in sorted(others.items())
+        )
+        return Program(text, tuple(points), frames, computed, notes)
 
     def to_arm(self, shown: Array) -> Array:
         """J3 from the upper arm on."""

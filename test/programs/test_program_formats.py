@@ -461,6 +461,27 @@ def test_fanuc_positions():
     assert "'********'" in three.problem
     assert three.tool is None
     assert found.computed == ((5, "P[3] 100mm/sec FINE Offset,PR[1]"),)
+    (note,) = found.notes
+    assert "group 2: its positions stay as they are, the first of 1 in line 7" in note
+
+
+def test_a_fanuc_position_of_another_group_is_told_and_no_position_of_the_robot():
+    """Beside the robot's, before it, and alone: as of a program for the second robot."""
+    text = FANUC.replace("GP2:", "GP3:").replace("   GP1:\n\tUF : F", "   GP2:\n\tUF : F")
+    other = "   GP2:\n\tUF : 0, UT : 1,\n\tX = 7.000 mm,\tY = 8.000 mm\n"
+    text = text.replace("P[2]{\n", f"P[2]{{\n{other}")
+    found = dialect_of(".ls").read(text)
+    one, two, three = found.points
+    assert one.numbers[0] == 1731.5
+    assert two.numbers[0] == 10.0
+    assert (three.name, three.fields, three.problem) == (
+        "P[3] gap", (), "has no position of group 1",
+    )  # fmt: skip
+    told = [note.partition(":")[0] + note.partition(",")[2] for note in found.notes]
+    assert told == [
+        "group 2 the first of 2 in line 16; group 1 alone is corrected",
+        "group 3 the first of 1 in line 7; group 1 alone is corrected",
+    ]
 
 
 def test_fanuc_options_on_the_line_behind():
