@@ -57,7 +57,10 @@ _ASSIGNED = re.compile(
 _MOVED = re.compile(
     rf"\b(?P<move>{MOVES}(?P<relative>_REL)?)\b[^\r\n{{}}]*(?:\{{[^{{}}]*\}}\s*,\s*)?$", re.I
 )
-_USED = re.compile(rf"\b{MOVES}\s+(\w+(?:\[\w+\])?)(?:\s*,\s*(\w+(?:\[\w+\])?))?", re.I)
+_NAME = r"(\w+(?:\[\w+\])?)"
+_USED = re.compile(rf"\b{MOVES}(?:\s+{_NAME}|\s*\{{[^{{}}]*\}})(?:\s*,\s*{_NAME})?", re.I)
+_INDEXED = r"(\w+(?:\[\d+\])?)(?:\[[^\]\r\n]*\])?"
+_RELATIVE = re.compile(rf"\b{MOVES}_REL\s+{_INDEXED}(?:\s*,\s*{_INDEXED})?", re.I)
 _DECLARED = re.compile(
     r"\b(?:E6POS|POS|E6AXIS|AXIS)\s+((?:\w+(?:\[[^\]\r\n]*\])?[ \t]*,?[ \t]*)+)", re.I
 )
@@ -90,7 +93,10 @@ _OPERAND = re.compile(r"\{\s*\w+[ \t]*:|:[ \t]*(\w+(?:\[\d+\])?)")
 _OPERATOR = re.compile(r"[ \t]*:")
 _REST = r"(?:[^\r\n{}]|\{[^{}\r\n]*\})*?"
 _PRODUCT = rf"{_REST}(?:[\w\])]|\{{[^{{}}\r\n]*\}})[ \t]*:[ \t]*[\w{{$]"
-_COMPUTED = re.compile(rf"\b{MOVES}(?:_REL)?\b(?:{_PRODUCT}|{_REST}\w\()[^\r\n]*", re.I)
+# A CIRC to an angle (CA) ends where the controller reckons.
+_COMPUTED = re.compile(
+    rf"\b{MOVES}(?:_REL)?\b(?:{_PRODUCT}|{_REST}(?:\w\(|,[ \t]*CA\b))[^\r\n]*", re.I
+)
 _CHANGED = re.compile(
     rf"^[ \t]*[A-Z]\w*(?:\[[^\]\r\n]*\])?\s*=(?!=){_PRODUCT}[^\r\n]*"
     r"|\b(?:TOOL|BASE)_DATA\[[^\]\r\n]*\](?:\.\w+)?\s*=(?![\s=]*\{)[^\r\n]*"
@@ -123,9 +129,9 @@ class KrlDialect(Dialect):
         for found in _DECLARED.finditer(clean):  # an array's points are assigned one by one
             used |= set(re.findall(r"\w+", re.sub(r"\[[^\]]*\]", "", found[1].upper())))
         reckoned: dict[str, int] = {}
-        for found in _OPERAND.finditer(clean):
-            if found[1] and (name := found[1].upper()) not in reckoned:
-                reckoned[name] = line_of(text, found.start())
+        for found in chain(_OPERAND.finditer(clean), _RELATIVE.finditer(clean)):
+            for name in filter(None, found.groups()):
+                reckoned.setdefault(name.upper(), line_of(text, found.start()))
         points: list[ProgramPoint] = []
         for braces in _BRACES.finditer(clean):
             point = _point(text, clean, braces, used)

@@ -198,13 +198,37 @@ POINT = "{X 1,Y 2,Z 3,A 0,B 0,C 0}"
         ),
         (f"DECL POS XP2\nXP2={POINT}:XP1\nXP2=XP1:{POINT}", {}, [4, 5]),
         ("DECL POS XP2={POS: X 1,Y 2,Z 3,A 0,B 0,C 0}\nLIN XP2", {"XP2": ""}, []),
+        (
+            f"DECL POS WAY={POINT}\nDECL E6POS XP1={POINT}\nLIN_REL WAY\nCIRC_REL XP1,WAY",
+            {
+                "WAY": "the program reckons with it in line 5",
+                "XP1": "the program reckons with it in line 6",
+            },
+            [],
+        ),
+        (
+            f"DECL E6POS WAY[2]\nWAY[1]={POINT}\nSLIN_REL WAY[I]",
+            {"WAY[1]": "the program reckons with it in line 5"},
+            [],
+        ),
     ],
 )
-def test_an_operand_of_the_geometric_operator_is_no_point(lines, points, computed):
+def test_an_operand_and_a_way_to_go_are_no_points(lines, points, computed):
     text = f"$TOOL=TOOL_DATA[1]\n$BASE=BASE_DATA[1]\n{lines}\n"
     found = dialect_of(".src").read(text)
     assert {point.name: point.problem for point in found.points} == points
     assert [line for line, _ in found.computed] == computed
+
+
+def test_both_points_of_a_circle_are_found_and_one_to_an_angle_is_told():
+    """Named and written out; where an angle is given the circle ends beyond its second point."""
+    lines = f"XP1={POINT}\nXP2={POINT}\nCIRC {POINT},XP1\nSCIRC XP2,{POINT}, CA 270.0\n"
+    found = dialect_of(".src").read(lines)
+    assert [point.name for point in found.points] == [
+        "XP1", "XP2", "CIRC in line 3", "SCIRC in line 4",
+    ]  # fmt: skip
+    assert not any(point.problem for point in found.points)
+    assert [line for line, _ in found.computed] == [4]
 
 
 def test_a_base_that_is_a_product_is_unknown():
