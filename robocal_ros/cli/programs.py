@@ -37,6 +37,7 @@ from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
 from robocal_ros.programs.conventions import COUNT, base_text, tool_text
 from robocal_ros.programs.correcting import (
+    LEAST_M,
     STATES,
     CorrectionModels,
     ProgramCorrection,
@@ -302,13 +303,12 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         dialect = FanucDialect(args.j23)
     if args.posture_deg is not None and len(args.posture_deg) != models.nominal.n:
         raise InputError(f"--posture-deg: {models.nominal.name} has {models.nominal.n} joints")
-    given = dict(frame_given(dialect.maker, words) for words in args.frame)
-    for path in args.frames:
-        given = _frames_of(path, dialect) | given
+    program = _program_text(args.program, dialect)
+    given = _given_frames(args, dialect, program)
     correction = ProgramCorrection(
         dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
     )
-    done = correction.correct(_program_text(args.program, dialect))
+    done = correction.correct(program)
     told = report(done)
     left = told["count"]["not_corrected"]
     verdict = Verdict(Code.ACCEPT, f"all of {len(done.points)} points are as they should be")
@@ -332,6 +332,23 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         "verdict": verdict_document(verdict),
     }
     return CliResult(document, _show_corrected)
+
+
+def _given_frames(args: argparse.Namespace, dialect: Dialect, program: str) -> dict[str, Array]:
+    """Tools and bases that ``--frame`` names, beside them those of the program and ``--frames``.
+
+    Raises `InputError` where two of the latter differ and nothing says which is meant.
+    """
+    named = dict(frame_given(dialect.maker, words) for words in args.frame)
+    settled = {name.lower() for name in named}
+    known = dict(dialect.read(program).frames) if args.frames else {}
+    for path in args.frames:
+        for name, T in _frames_of(path, dialect).items():
+            first = known.setdefault(name, T)
+            if name.lower() not in settled and not np.allclose(first, T, rtol=0.0, atol=LEAST_M):
+                words = f"{name} is another one than in the program, or in the file before"
+                raise InputError(f"{words}: say by --frame '{name}=…' which holds", file=str(path))
+    return known | named
 
 
 def _frames_of(path: Path, dialect: Dialect) -> dict[str, Array]:

@@ -65,7 +65,9 @@ _DECLARED = re.compile(
     r"\b(?:E6POS|POS|E6AXIS|AXIS)\s+((?:\w+(?:\[[^\]\r\n]*\])?[ \t]*,?[ \t]*)+)", re.I
 )
 _FDAT = re.compile(r"\bFDAT\s+(\w+)\s*=\s*\{([^{}]*)\}", re.I)
-_FRAME_DATA = re.compile(r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\]\s*=\s*\{([^{}]*)\}", re.I)
+_FRAME_DATA = re.compile(
+    r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\](?:\.\w+)?\s*=(?!=)\s*(?:\{([^{}]*)\}(?!\s*:))?", re.I
+)
 _SET = re.compile(
     r"\$(?P<kind>TOOL|BASE)(?P<part>\.\w+)?\s*=(?!=)\s*"
     r"(?P<value>(?:\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?)[^\r\n;]*)"
@@ -118,10 +120,8 @@ class KrlDialect(Dialect):
         clean = masked(text, ";")
         frames = {"TOOL_DATA[0]": np.eye(4), "BASE_DATA[0]": np.eye(4)}
         frames |= {name: np.eye(4) for name in ROBROOT}
-        for found in _FRAME_DATA.finditer(clean):
-            T = _frame(found[3])
-            if T is not None:
-                frames[f"{found[1].upper()}[{found[2]}]"] = T
+        numbered, again = _numbered_frames(text, clean)
+        frames |= numbered
         inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
         flow, within = _flow(text, clean, frames, inline), _withs(text, clean, frames, inline)
         used = {name.upper() for found in _USED.finditer(clean) for name in found.groups() if name}
@@ -138,6 +138,9 @@ class KrlDialect(Dialect):
             if point is None:
                 continue
             point = _framed(point, braces.start(), inline, flow, within)
+            if not point.joints:
+                moves = again.get(point.tool or "") or again.get(point.frame or "", "")
+                point = replace(point, problem=point.problem or moves)
             name = point.name.upper()
             if line := reckoned.get(name, reckoned.get(name.partition("[")[0])):
                 problem = f"the program reckons with it in line {line}"
@@ -191,6 +194,19 @@ def _frame(body: str) -> Array | None:
     if len(fields) < len(POSE) or require_numbers(fields):
         return None
     return pose_of("kuka", [part.value for part in fields])
+
+
+def _numbered_frames(text: str, clean: str) -> tuple[dict[str, Array], dict[str, str]]:
+    """TOOL_DATA and BASE_DATA that the text gives; why those that it gives anew are unknown."""
+    values: dict[str, Array | None] = {}
+    again: dict[str, str] = {}
+    for found in _FRAME_DATA.finditer(clean):
+        name, T = f"{found[1].upper()}[{found[2]}]", _frame(found[3] or "")
+        first = values.setdefault(name, T)
+        if first is not T and (first is None or T is None or not np.array_equal(first, T)):
+            again.setdefault(name, f"{name} is set again in line {line_of(text, found.start())}")
+    known = {name: T for name, T in values.items() if T is not None and name not in again}
+    return known, again
 
 
 def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> ProgramPoint | None:

@@ -145,6 +145,23 @@ def test_frames_and_bounds_come_from_the_command_line(folder: Path, capsys):
     assert "NAME=X,Y,Z" in document["error"]["message"]
 
 
+def test_a_frame_of_two_values_is_refused_until_it_is_named(folder: Path, capsys):
+    other = KUKA_FRAMES.replace("X 900.0", "X 901.0")
+    (folder / "other.dat").write_text(other)
+    weld = (folder / "weld.dat").read_text("latin-1")
+    (folder / "own.dat").write_text(weld.replace("ENDDAT", f"{other}ENDDAT"), "latin-1")
+    two = (*KNOWN, "--frames", "other.dat")
+    for program, given, file in (("weld.dat", two, "other.dat"), ("own.dat", KNOWN, "$config.dat")):
+        status, document = command(capsys, program, *MODEL, *given)
+        assert (status, document["error"]["file"]) == (2, file)
+        assert "BASE_DATA[5] is another one than" in document["error"]["message"]
+    named = ("--frame", "BASE_DATA[5]=900,-250.5,410.75,12,-3,5")
+    _, expected = command(capsys, "weld.dat", *MODEL, *KNOWN)
+    for program, given in (("weld.dat", two), ("own.dat", KNOWN)):
+        _, document = command(capsys, program, *MODEL, *given, *named)
+        assert document["points"] == expected["points"]
+
+
 def test_a_file_without_frames_is_refused_where_frames_are_wanted(folder: Path, capsys):
     (folder / "none.dat").write_text("DEFDAT A\nENDDAT\n")
     (folder / "sysframe.ls").write_text("UFRAME[1]: X 1.0 Y 2.0 Z 3.0\n")

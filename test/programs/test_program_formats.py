@@ -239,6 +239,20 @@ def test_a_base_that_is_a_product_is_unknown():
         assert "$BASE of line 1" not in found.frames
 
 
+def test_a_base_that_the_program_sets_anew_is_unknown():
+    """Whole or in part; the same once more is no other, and joints do without."""
+    text = (
+        f"BASE_DATA[1]={POINT}\nBASE_DATA[2]={POINT}\nBASE_DATA[3]={POINT}\n"
+        f"BASE_DATA[1]={POINT}\nBASE_DATA[2]={POINT.replace('X 1', 'X 9')}\nBASE_DATA[3].Z=5\n"
+    )
+    text += "".join(f"$BASE=BASE_DATA[{n}]\nLIN {POINT}\n" for n in (1, 2, 3))
+    found = dialect_of(".src").read(f"{text}PTP {{A1 0,A2 -90,A3 90,A4 0,A5 30,A6 0}}\n")
+    assert [point.problem for point in found.points] == [
+        "", "BASE_DATA[2] is set again in line 5", "BASE_DATA[3] is set again in line 6", "",
+    ]  # fmt: skip
+    assert found.frames.keys() & {f"BASE_DATA[{n}]" for n in (1, 2, 3)} == {"BASE_DATA[1]"}
+
+
 def test_points_in_an_array_are_found_whatever_counts_them():
     text = f"P[1]={POINT}\nQ[1]={POINT}\nR[1]={POINT}\nFOR I=1 TO 2\nPTP P[I]\nLIN Q[1]\nENDFOR\n"
     assert [point.name for point in dialect_of(".src").read(text).points] == ["P[1]", "Q[1]"]
