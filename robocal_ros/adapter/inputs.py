@@ -92,12 +92,21 @@ def gpio_levels(message: Any) -> Mapping[str, bool]:
     """Interfaces by ``group/name`` of what gpio_controllers publish; those without a value are out.
 
     ``control_msgs/DynamicInterfaceGroupValues``, before 2025 ``DynamicJointState``.
+
+    Raises `InputError` when names and values differ in number: whose is which is not known then.
     """
     names = getattr(message, "interface_groups", None)
-    groups = message.joint_names if names is None else names
+    groups, told = message.joint_names if names is None else names, message.interface_values
+    pairs = list(zip(groups, told, strict=False))
+    sizes = [("groups", len(groups), len(told))]
+    sizes += [(f"names of {g}", len(v.interface_names), len(v.values)) for g, v in pairs]
+    for what, count, values in sizes:
+        if count != values:
+            words = f"has {count} {what}, but {values} of their values"
+            raise InputError(f"{words}: its publisher is at fault, mend or update that")
     return {
         f"{group}/{name}": value > ANALOG_HIGH
-        for group, values in zip(groups, message.interface_values, strict=True)
+        for group, values in pairs
         for name, value in zip(values.interface_names, values.values, strict=True)
         if isfinite(value)
     }

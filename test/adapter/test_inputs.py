@@ -95,6 +95,29 @@ def test_gpio_interfaces_are_told_by_group_and_name(types: Any, kind: str, names
         level_of(gpio_levels(message), "south/spare")
 
 
+@pytest.mark.parametrize(
+    ("groups", "values", "words"),
+    [
+        (["north", "south"], [1.0, 0.0], "2 groups, but 1 of"),
+        (["north"], [1.0], "2 names of north, but 1 of"),
+        (["north"], [1.0, 0.0, 1.0], "2 names of north, but 3 of"),
+    ],
+)
+def test_gpio_arrays_of_unequal_lengths_are_their_publishers_fault(
+    types: Any, groups: list[str], values: list[float], words: str
+) -> None:
+    value = types.of["control_msgs/msg/InterfaceValue"]
+    told = [value(interface_names=["beam_x", "beam_y"], values=np.array(values))]
+    stamp = types.of["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    message = types.sent(
+        "control_msgs/msg/DynamicInterfaceGroupValues",
+        header=types.of["std_msgs/msg/Header"](stamp=stamp, frame_id=""),
+        interface_groups=groups, interface_values=told,
+    )  # fmt: skip
+    with pytest.raises(InputError, match=f"{words} their values: its publisher is at fault"):
+        gpio_levels(message)
+
+
 @given(
     st.floats(0.0, 0.2), st.integers(1_000, 10**9), st.booleans(),
     st.integers(0, 2**60), st.floats(1e-6, 0.1),
