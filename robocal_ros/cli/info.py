@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from robocal_ros.cli.main import CliResult, Document, describe_robot, print_table, print_words
 from robocal_ros.ground.errors import InputError, RobocalError
@@ -147,7 +148,7 @@ def _history(path: Path) -> Told:
     from robocal_ros.history.calibrations import CalibrationHistory
     from robocal_ros.history.history_records import THERMAL
 
-    serial, folder = path.stem, path.absolute().parent
+    serial, folder = unquote(path.stem), path.absolute().parent
     with CalibrationHistory.open(serial, state_dir=folder, create=False, owner=False) as history:
         heads = history.heads()
         facts = [("calibrations", str(len(history.list(1_000_000))))]

@@ -50,6 +50,7 @@ from robocal_ros.history.history_records import (
     read_decisions,
     read_json,
     require_measured_with,
+    rows_up_to,
 )
 
 if TYPE_CHECKING:
@@ -395,7 +396,7 @@ class HistoryReader:
     def list(self, limit: int = 50) -> tuple[Entry, ...]:
         """Latest calibrations, newest first."""
         with self._reading() as connection:
-            rows = read_candidates(connection, "ORDER BY id DESC LIMIT ?", max(limit, 0))
+            rows = read_candidates(connection, "ORDER BY id DESC LIMIT ?", rows_up_to(limit))
             return tuple(self._entry(*row) for row in rows)
 
     def get(self, calibration_id: int) -> Entry:

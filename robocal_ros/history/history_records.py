@@ -320,6 +320,11 @@ def read_decisions(
     )
 
 
+def rows_up_to(limit: int) -> int:
+    """As many rows as an SQL LIMIT can ask for: none below zero, and 64 bits hold it."""
+    return min(max(limit, 0), _LARGEST_ID)
+
+
 def read_candidates(
     connection: sqlite3.Connection, clause: str, *values: str | int
 ) -> Iterator[tuple[int, Candidate]]:
@@ -442,7 +447,7 @@ def insert_correction(connection: sqlite3.Connection, record: CorrectionRecord) 
 def read_corrections(connection: sqlite3.Connection, limit: int) -> Iterator[CorrectionRecord]:
     """The latest records, newest first."""
     chosen = f"SELECT {', '.join(_CORRECTION_COLUMNS)} FROM corrections ORDER BY seq DESC LIMIT ?"
-    for row in connection.execute(chosen, (max(limit, 0),)):
+    for row in connection.execute(chosen, (rows_up_to(limit),)):
         values = dict(zip(_CORRECTION_COLUMNS, row, strict=True))
         for name in ("enabled", "shadow"):
             values[name] = bool(values[name])

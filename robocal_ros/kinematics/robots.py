@@ -52,14 +52,15 @@ class _StrictLoader(SafeLoader):
 def load_yaml(text: str, file: str) -> Any:
     """Parse YAML.
 
-    Raises `InputError` with file and row, when it is not YAML or gives a key twice.
+    Raises `InputError` with file and row, when it is not YAML or gives a key twice; without a row
+    for a value that is none of its kind, as the date 2026-02-30.
     """
     try:
         return yaml.load(text, Loader=_StrictLoader)
     except yaml.MarkedYAMLError as error:
         row = error.problem_mark.line + 1 if error.problem_mark else None
         raise InputError(f"not valid YAML: {error.problem}", file=file, row=row) from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"not valid YAML: {error}", file=file) from error
 
 

@@ -78,6 +78,9 @@ class TestReading:
         assert first["decisions"][0]["by"] == "node"
         one = robocal_json("history.list.json", "history", "list", "--state", state, "--limit", "1")
         assert [c["id"] for c in one["calibrations"]] == [3]
+        most = str(2**70)  # beyond what SQLite counts to
+        every = ("history", "list", "--state", state, "--limit", most)
+        assert robocal_json("history.list.json", *every) == document
 
     def test_corrections(self, state):
         name = "history.corrections.json"
@@ -111,6 +114,7 @@ class TestReading:
             first,
         ]
         assert robocal_json(name, *call, "--limit", "1")["corrections"] == found[:1]
+        assert robocal_json(name, *call, "--limit", str(2**70))["corrections"] == found
         lines = robocal(*call).stdout.splitlines()
         for line, words in zip(lines[-2:], (("on", "3"), ("off", "none")), strict=True):
             assert {*words, "taught", "calibrated", "[1].yaml", "fedcba98"} <= set(line.split())

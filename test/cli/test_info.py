@@ -66,8 +66,9 @@ def made(tmp_path_factory):
     (folder / "empty.yaml").write_text("kinematics:\n")
     (folder / "cell 4.csv").write_bytes((TABLES / "measured.csv").read_bytes())
     nominal = load_robot("ur10")
-    with CalibrationHistory.open("R7", model_hash=nominal.model_hash, state_dir=folder):
-        pass
+    for serial in ("R7", "R/9"):
+        with CalibrationHistory.open(serial, model_hash=nominal.model_hash, state_dir=folder):
+            pass
     warm = {"model_hash": nominal.model_hash, "model": model_document(nominal)}
     with CalibrationHistory.open("R8", model_hash=nominal.model_hash, state_dir=folder) as history:
         history.accept(history.propose(proposal(**warm)), **BY)
@@ -93,6 +94,7 @@ def made(tmp_path_factory):
         ("cell 4.csv", "measurements: joints, and where", "joints: 6"),
         ("R7.sqlite", "history of the robot with serial R7", "calibrations: 0"),
         ("R8.sqlite", "history of the robot with serial R8", "thermal in force: revision 1"),
+        ("R%2F9.sqlite", "history of the robot with serial R/9", "calibrations: 0"),
         ("shown.json", "calibration of a history", "verdict: "),
         ("mount.json", "result of a robocal command", "ACCEPT: good"),
         ("tool.json", "result of a robocal command", "ACCEPT: good"),

@@ -175,6 +175,14 @@ def test_broken_yaml_is_refused_with_its_row(tmp_path: Path) -> None:
     assert caught.value.row == 3
 
 
+@pytest.mark.parametrize("name", ["2026-02-30", "!!bool x", "!!timestamp x", "!!map [x]"])
+def test_a_value_that_is_none_of_its_kind_is_no_yaml(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path, GOOD.replace("robot: test arm", f"robot: {name}"))
+    with pytest.raises(InputError, match="not valid YAML") as caught:
+        load_robot(path)
+    assert caught.value.file == str(path)
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_calibrated_arm_is_saved_and_read_back(tmp_path: Path, name: str) -> None:
     nominal = load_robot(name)
