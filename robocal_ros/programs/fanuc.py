@@ -43,6 +43,7 @@ _WORDS = re.compile(r"\s*[NF]\s+[UD]\s+[TB]\s*(?:,\s*-?\d+\s*){3}")
 # Options of a motion stand up to its next position (of a circle) or its end, on further lines too.
 _OPTIONS = r"(?:(?!\bP\[)[^;])*"
 _RELATIVE = re.compile(rf"\bP\[\s*(\d+)[^\]]*\]{_OPTIONS}\bINC\b")
+_LED = re.compile(r"[JLCA]\s+P\[[^\]]*\][^;]*?\bCOORD\b")
 _COMPUTED = re.compile(
     rf"[JLCA]\s+PR\[[^\]]*\]|\bP\[[^\];\n]*\]{_OPTIONS}\b(?:\w+_)?Offset\b{_OPTIONS}"
     r"|\b(?:P|UFRAME|UTOOL)\[[^\];\n]*\]\s*=[^;\n]*",
@@ -92,12 +93,17 @@ class FanucDialect(Dialect):
             (line_of(text, found.start()), " ".join(found[0].split()).rstrip(" :"))
             for found in _COMPUTED.finditer(text, 0, start)
         )
-        notes = tuple(
+        notes = [
             f"group {number}: its positions stay as they are, the first of {len(lines)} in line "
             f"{lines[0]}; group 1 alone is corrected"
             for number, lines in sorted(others.items())
-        )
-        return Program(text, tuple(points), frames, computed, notes)
+        ]
+        if led := _LED.search(text, 0, start):
+            notes.append(
+                f"line {line_of(text, led.start())}: COORD: points are corrected as if no other "
+                "group carried their user frame"
+            )
+        return Program(text, tuple(points), frames, computed, tuple(notes))
 
     def to_arm(self, shown: Array) -> Array:
         """J3 from the upper arm on."""

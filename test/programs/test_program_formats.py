@@ -522,6 +522,19 @@ def test_a_fanuc_position_of_another_group_is_told_and_no_position_of_the_robot(
     ]
 
 
+@pytest.mark.parametrize(
+    ("motion", "led"),
+    [
+        ("L P[1] 9mm/sec FINE COORD PTH ;", True),
+        ("C P[1]\n    :  P[2] 9mm/sec FINE\n    :  COORD ;", True),
+        ("L P[1:COORD] 9mm/sec FINE ;\n   2:  !COORD ;", False),
+    ],
+)
+def test_fanuc_motions_that_another_group_leads_are_told(motion, led):
+    notes = dialect_of(".ls").read(f"/PROG  A\n/MN\n   1:{motion}\n/POS\n/END\n").notes
+    assert [note.startswith("line 3: COORD") for note in notes] == [True] * led
+
+
 def test_fanuc_options_on_the_line_behind():
     """As controllers write circles and long motions; the second point is not relative."""
     lines = "   1:C P[1] INC\n    :  P[2] 9mm/sec FINE\n    :  WKZ_Offset,PR[1]    ;\n"
