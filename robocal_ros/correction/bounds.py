@@ -494,6 +494,11 @@ class CorrectionGate:
         self.payload = payload_note(arm, model.load, self._reference.load)
         self.survey = survey(self._reference, arm, self._config.thermal)
 
+    def know_past(self, model_ns: int, tool_ns: int) -> None:
+        """As if a model and a tool of these stamps had been taken over, and left again."""
+        self._newest_ns = max(self._newest_ns, model_ns)
+        self.tools.newest_ns = max(self.tools.newest_ns, tool_ns)
+
     def _use(self, model: OfferedModel) -> None:
         self._model, self._arm, self.revision = model, self._arm_of(model), model.revision
         self._newest_ns = max(self._newest_ns, model.stamp_ns)
@@ -588,7 +593,7 @@ class ToolGate:
         self.in_use: OfferedTool | None = None
         self.waiting: OfferedTool | None = None
         self.refused: OfferedTool | None = None
-        self._newest_ns = 0  # stamp of all that were taken
+        self.newest_ns = 0  # stamp of all that were taken
 
     @property
     def T_flange_tool(self) -> Array | None:
@@ -617,7 +622,7 @@ class ToolGate:
         self.refused = None
         last = self.waiting or self.in_use
         known = last is not None and _same_tool(tool, last)
-        later = last is None or _later(tool, last, self._newest_ns) or _retaught(tool, last)
+        later = last is None or _later(tool, last, self.newest_ns) or _retaught(tool, last)
         if not (known or later or again):
             self.refused = tool
             raise RefusedError(
@@ -625,7 +630,7 @@ class ToolGate:
                 f"tool revision {tool.revision} is another tool than the last one and not newer "
                 "by its stamp; ~/take_over takes it over",
             )
-        self._newest_ns = max(self._newest_ns, tool.stamp_ns)
+        self.newest_ns = max(self.newest_ns, tool.stamp_ns)
         if self.in_use is not None and _same_tool(tool, self.in_use):
             self.in_use, self.waiting = tool, None
         else:

@@ -21,7 +21,13 @@ from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
-from robocal_ros.history.history_records import CALIBRATED, NOMINAL, CorrectionRecord
+from robocal_ros.history.history_records import (
+    CALIBRATED,
+    NOMINAL,
+    THERMAL,
+    TOOL,
+    CorrectionRecord,
+)
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import RobotDescription
 from robocal_ros.ros import endpoints
@@ -53,7 +59,8 @@ class CorrectionLog:
 
     A thread of its own reads and writes: a disk that is slow, full or locked holds no command up.
     What cannot be written is told and tried again. ``fault`` says why something waits to be
-    written, ``damage`` what is wrong with a history that nobody has acknowledged.
+    written, ``damage`` what is wrong with a history that nobody has acknowledged. ``past_ns``:
+    stamps of the newest model and tool that were in force and, when a record was written, no more.
     """
 
     def __init__(self, settings: Mapping[str, Any], robot: RobotDescription) -> None:
@@ -62,6 +69,7 @@ class CorrectionLog:
         self._noted: queue.SimpleQueue[CorrectionRecord | str] = queue.SimpleQueue()
         self._waiting: deque[CorrectionRecord] = deque(maxlen=MOST_WAITING)
         self.fault = self.damage = ""
+        self.past_ns = 0, 0
         self._thread = threading.Thread(target=self._run, name="correction_log", daemon=True)
         self._thread.start()
 
@@ -99,6 +107,7 @@ class CorrectionLog:
                 self.damage = ""
             if self._waiting:
                 with open_history(self._settings, self._robot, owner=False)[1] as history:
+                    self.past_ns = history.newest_past_ns(THERMAL), history.newest_past_ns(TOOL)
                     while self._waiting:
                         history.note_correction(self._waiting[0])
                         self._waiting.popleft()
@@ -175,6 +184,7 @@ class CorrectionReport:
         ``commanders``: who else commands; ``lease``: who holds one; empty where nobody does.
         """
         now = time.monotonic()
+        self._session.know_past(*self.log.past_ns)
         status = self._session.status(now)
         message = self._message(status)
         message.commanders, message.lease, message.history = commanders, lease, self.log.damage

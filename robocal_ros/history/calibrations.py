@@ -265,6 +265,11 @@ _FIXTURES = (
     "GROUP BY kind"
 )
 
+_PAST = (
+    "SELECT max(stamp_ns) FROM calibrations WHERE kind = ? AND id <> ? AND id IN "
+    "(SELECT calibration_id FROM decisions WHERE action = ?)"
+)
+
 BUSY_TIMEOUT_S = 2.0
 """Longest wait for another process's change, itself a matter of milliseconds."""
 
@@ -438,6 +443,13 @@ class HistoryReader:
         """
         with self._reading() as connection:
             return read_decisions(connection, after_seq, newest)
+
+    def newest_past_ns(self, kind: str) -> int:
+        """Stamp of the newest that was in force and is so no more; 0 without any."""
+        with self._reading() as connection:
+            in_force = self._ledger.head(kind)[1] or 0
+            (newest,) = connection.execute(_PAST, (kind, in_force, Action.ACCEPT)).fetchone()
+            return int(newest or 0)
 
     def corrections(self, limit: int = 50) -> tuple[CorrectionRecord, ...]:
         """What the robot's commands were corrected with, newest first."""

@@ -172,6 +172,16 @@ def test_a_model_that_was_rolled_back_stays_so_where_its_message_is_repeated() -
         assert robot.session.status().revision == revision
 
 
+def test_a_model_that_was_rolled_back_before_the_session_stays_so_where_it_is_repeated() -> None:
+    robot = Robot()
+    robot.session.know_past(200, 0)
+    robot.session.offer_model(offer(NOMINAL, 9))
+    refused(Reason.OLD_REVISION, robot.session.offer_model, offer(drifted(), 7, stamp_ns=200))
+    assert robot.session.status().revision == 9
+    robot.session.offer_model(offer(drifted(), 7, stamp_ns=201))  # the history began again
+    assert robot.session.status().revision == 7
+
+
 @pytest.mark.parametrize("on", [False, True])
 def test_a_history_that_began_again_waits_for_the_operator_without_a_newer_stamp(on: bool) -> None:
     robot = Robot()

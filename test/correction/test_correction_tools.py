@@ -157,6 +157,13 @@ def test_a_tool_that_was_rolled_back_stays_so_where_its_message_is_repeated(robo
     assert not robot.session.status().new_tool
 
 
+def test_a_tool_that_was_rolled_back_before_the_session_stays_so(robot: Robot) -> None:
+    robot.session.know_past(0, 200)
+    robot.change_tool(bent_tool(revision=7, T_flange_tool=None))
+    refused(Reason.OLD_REVISION, robot.session.offer_tool, bent_tool(revision=5, stamp_ns=200))
+    assert not robot.session.status().new_tool
+
+
 def test_that_a_tool_says_nothing_of_the_mounted_one_is_news(robot: Robot) -> None:
     """tcf_node says so of the same revision, once another tool is taught; and takes it back."""
     robot.change_tool(bent_tool(revision=5, stamp_ns=10))

@@ -214,6 +214,21 @@ class TestDecisions:
             CalibrationState.IN_FORCE,
         ]
 
+    def test_the_newest_that_was_in_force_once(self, history: CalibrationHistory) -> None:
+        """Neither the one that is, nor what never was."""
+        past = []
+        for revision, stamp_ns in enumerate((30, 40, 20)):
+            number = history.propose(proposal(based_on=revision, stamp_ns=stamp_ns))
+            history.accept(number, **BY)
+            past.append(history.newest_past_ns("thermal"))
+        history.propose(proposal(based_on=3, stamp_ns=50))
+        assert past == [0, 30, 40]
+        for _ in range(2):
+            history.rollback(**BY)
+            past.append(history.newest_past_ns("thermal"))
+        assert past[3:] == [30, 40]
+        assert history.newest_past_ns("tool") == 0
+
     def test_what_needs_another_kind_beside_it(self, history: CalibrationHistory) -> None:
         thermal = history.propose(proposal())
         tool = history.propose(proposal(kind="tool"))

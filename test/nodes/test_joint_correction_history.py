@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from history_workers import proposal
 from joint_correction_live import (
     HOME,
     NODE,
@@ -28,6 +29,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import CALIBRATED, CorrectionRecord
 from robocal_ros.history.history_records import NOMINAL as AS_NOMINAL
 from robocal_ros.kinematics.robots import load_description, save_robot
+from robocal_ros.ros.conversions import header
 from robocal_ros.ros.session_node import history_notice
 
 
@@ -78,6 +80,24 @@ def test_each_change_is_kept_with_the_choice_of_the_reference(graph: Any) -> Non
     line.enable(False)  # changes nothing
     graph.spin_for(2.5 * 0.1)
     assert len(kept(graph)) == 5
+
+
+def test_what_the_history_has_rolled_back_stays_so_where_its_message_is_repeated(
+    graph: Any,
+) -> None:
+    """As by a bridge: the node never had it in use."""
+    stamp_ns, by = 1_700_000_000_000_000_000, {"by": "Ada", "reason": "", "wall_ns": 1}
+    with CalibrationHistory.open("s1", state_dir=graph.state) as history:
+        made = {"model_hash": NOMINAL.model_hash, "stamp_ns": stamp_ns}
+        history.accept(history.propose(proposal(**made)), **by)
+        history.rollback(0, **by)
+    line = Line(graph)
+    after(graph, 1)
+    line.take(model_message(NOMINAL, 2), line.to_model, "kinematic_model")
+    withdrawn = model_message(drifted(), 1, stamp=header(stamp_ns, "base"))
+    line.refused(line.to_model, withdrawn, "kinematic_model")
+    told = line.told(model_waits=True)
+    assert (told.model_revision, told.waiting_model_revision) == (2, 1)
 
 
 def test_a_calibrated_reference_is_kept_and_shown(graph: Any, tmp_path: Path) -> None:
