@@ -14,7 +14,7 @@ import numpy as np
 
 from robocal_ros.cell_sim.faults import Faults
 from robocal_ros.cell_sim.robot import Draws, Stream
-from robocal_ros.fixture.features import Feature, Fixture
+from robocal_ros.fixture.features import PLANE, Feature, Fixture
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array
 
@@ -53,6 +53,18 @@ class FeatureShot:
 
     at_s: float
     point: Array
+
+
+def along(feature: Feature, aside: Array) -> Array:
+    """What of ``aside`` (3,) stays on a feature: in a plane, along an edge or an axis, no other.
+
+    By its shape alone: what the estimator reads of it (`Feature.components`) is what is tried.
+    """
+    if feature.direction is None:
+        return np.zeros(3)
+    n = feature.direction / np.linalg.norm(feature.direction)
+    lengthwise = n * (n @ aside)
+    return np.asarray(aside - lengthwise if feature.kind == PLANE else lengthwise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +126,7 @@ class FixtureStation:
         feature = fixture.by_name.get(names[best])
         point = there[best]
         if feature is not None:
-            blind = np.eye(3) - feature.components.T @ feature.components
             R = T_moved[:3, :3] @ fixture.T_base_fixture[:3, :3]
-            point = point + R @ blind @ rng.uniform(-ASIDE_M, ASIDE_M, 3)
+            point = point + R @ along(feature, rng.uniform(-ASIDE_M, ASIDE_M, 3))
         told = frames.apply(T_sensor_base, point) + self.noise_m * rng.standard_normal(3)
         return FeatureShot(at_s, told)
