@@ -327,6 +327,12 @@ class DriftFollower:
                 tracker.read_temperatures(temperature - cold, time_s)
                 self.read_ns = stamp_ns
 
+    def unread(self, silent: Sequence[str]) -> str:
+        """What to say of joints of whose motors no temperature comes; empty where none is asked."""
+        if self.state.heat is None or not silent:
+            return ""
+        return f"no temperature of {', '.join(silent)}: see what sends motor_temperatures"
+
     @contextmanager
     def looking_ahead(
         self, between: Callable[[int, int], Sequence[tuple[int, Array]]], until_ns: int

@@ -561,10 +561,13 @@ class ThermalNode(SessionNode[ThermalSession]):
     def _show_accuracy(self) -> None:
         if self._session is None:
             return
-        newest = self._session.desk.newest_ns.get(JOINTS)
-        stamp_ns = self._data_clock.at(newest, self.now_ns())
+        stamp_ns = self._stamp_ns(self._session)
         found = self._session.accuracy(stamp_ns)
         self._outputs.accuracy(found, self._session.config.tolerance_m, stamp_ns)
+
+    def _stamp_ns(self, session: ThermalSession) -> int:
+        """Now, on the samples' clock."""
+        return self._data_clock.at(session.desk.newest_ns.get(JOINTS), self.now_ns())
 
     def report(self, session: ThermalSession, history: CalibrationHistory, health: Health) -> None:
         """Tell what waits, how far the cycle is, and what was lost."""
@@ -572,6 +575,8 @@ class ThermalNode(SessionNode[ThermalSession]):
         try:
             pending = [entry.id for entry in history.pending()]
             values["pending candidates"] = ", ".join(map(str, pending)) or "none"
+            if unread := session.unread_motors(self._stamp_ns(session)):
+                health.worsen(WARN, unread)
         except RobocalError as error:
             health.worsen(ERROR, str(error))
         values["cold reference"] = "captured" if session.current.reference_id else "none"

@@ -544,19 +544,19 @@ class MotorTemperatures:
                 found.append((now_ns, celsius.copy()))
         return found
 
-    def at(self, stamp_ns: int) -> Array | None:
-        """Temperatures (n,) at a stamp; None where they are not known."""
-        found = self.between(stamp_ns - SILENT_NS, stamp_ns)
+    def at(self, stamp_ns: int, until_ns: int | None = None) -> Array | None:
+        """Temperatures (n,) at a stamp, as read up to another one; None where not known."""
+        found = self.between(stamp_ns - SILENT_NS, stamp_ns if until_ns is None else until_ns)
         return found[-1][1] if found else None
 
-    def silent(self, stamp_ns: int) -> tuple[str, ...]:
-        """Joints of which no temperature is known at a stamp."""
-        after_ns = stamp_ns - SILENT_NS
+    def silent(self, stamp_ns: int, until_ns: int | None = None) -> tuple[str, ...]:
+        """Joints of which no temperature is known at a stamp, as read up to another one."""
+        after_ns, last_ns = stamp_ns - SILENT_NS, stamp_ns if until_ns is None else until_ns
         read = {
             joint
-            for ten in range(after_ns // EVERY_NS, stamp_ns // EVERY_NS + 1)
+            for ten in range(after_ns // EVERY_NS, last_ns // EVERY_NS + 1)
             for joint, sample in self._kept.get(ten, {}).items()
-            if after_ns < sample.stamp_ns <= stamp_ns
+            if after_ns < sample.stamp_ns <= last_ns
         }
         return tuple(name for name, joint in self._place.items() if joint not in read)
 

@@ -224,9 +224,9 @@ class Proposer:
             found = identify_subset(spots, data, names, sigma_m=config.sigma_m)
             judged = judge_cycle(found, spots, in_force=in_force, sigma_m=config.sigma_m)
         verdict = judged.verdict
-        if words := other_sides(spots, data):
+        for words in filter(None, (other_sides(spots, data), follower.unread(beside.silent))):
             verdict = replace(verdict, reason=f"{verdict.reason}; {words}")
-            judged = replace(judged, verdict=verdict)
+        judged = replace(judged, verdict=verdict)
         model = (
             model_document(found.arm)
             | held

@@ -223,13 +223,15 @@ class ThermalSession(SessionBase):
 
     def _beside(self, command: Command, data: Measurements, fixed: Array) -> Beside:
         """With the motor temperatures up to the middle of what was measured."""
-        until_ns = min(data.middle_ns, (command.marks or {}).get(TEMPERATURES, -1))
+        middle_ns = data.middle_ns
+        until_ns = min(middle_ns, (command.marks or {}).get(TEMPERATURES, -1))
         after_ns = 0 if self.follower is None else self.follower.read_ns
         readings = self.temperatures.between(after_ns, until_ns)
         if self.config.arrangement == FLANGE:  # all spheres are fixed, and targets
             fixed = fixed[:0]
         motors = self.temperatures
-        return Beside(fixed, readings, motors.at(until_ns), motors.silent(until_ns))
+        now, silent = motors.at(middle_ns, until_ns), motors.silent(middle_ns, until_ns)
+        return Beside(fixed, readings, now, silent)
 
     def _close_cycle(self, command: Command) -> None:
         self.cycle.id = ""
@@ -305,6 +307,11 @@ class ThermalSession(SessionBase):
         except RobocalError as error:
             return Accuracy(AccuracyLevel.FAULT, str(error))
 
+    def unread_motors(self, stamp_ns: int) -> str:
+        """Which motors' temperatures the drift is followed by and do not come, in words."""
+        follower = self.follower
+        return "" if follower is None else follower.unread(self.temperatures.silent(stamp_ns))
+
     def require_unmoved(self) -> None:
         """Raise `ConflictError` where the last cycle found that something was moved."""
         if self.follower is not None and self.follower.state.moved:
@@ -355,6 +362,7 @@ class ThermalSession(SessionBase):
             level, words = AccuracyLevel.DEGRADED, f"{words}: measure a cycle, accept its model"
         elif due_in_s <= 0.0:
             level, words = AccuracyLevel.DUE, f"{words}: measure a cycle"
+        words = "; ".join(filter(None, (words, self.unread_motors(stamp_ns))))
         return Accuracy(level, words, error, due_in_s)
 
 

@@ -166,6 +166,7 @@ def test_silent_temperatures_cost_certainty_and_not_the_cycle(learned):
     follower = learned.session.follower
     forecast = follower.forecast(learned.session.current.arm)
     _, before = forecast.drift_at(follower.time_s(learned.shift.now_ns))
+    learned.warmth(9.0)
     learned.temperatures = False
     try:
         learned.shift.now_ns += 3600 * NS
@@ -178,6 +179,20 @@ def test_silent_temperatures_cost_certainty_and_not_the_cycle(learned):
     assert found.status.name != "SENSOR_OR_ROBOT_MOVED"
     assert "motor_temperature" not in learned.history.inputs(found.calibration_id)
     assert follower.state.heat.time_s < follower.state.tracker.time_s - 3000.0
+
+
+def test_a_motor_that_falls_silent_is_named_by_accuracy_and_cycle(learned):
+    assert learned.visit(events.CAPTURE_REFERENCE, 0.0, 12.0).done
+    session, (first, *_) = learned.session, learned.nominal.joint_names
+    assert "no temperature" not in session.accuracy(learned.shift.now_ns).reason
+    learned.silent = (first,)
+    try:
+        found = learned.visit(events.IDENTIFY, 4.0, 0.3)
+    finally:
+        learned.silent = ()
+    words = f"no temperature of {first}: see what sends motor_temperatures"
+    for reason in (found.message, session.accuracy(learned.shift.now_ns).reason):
+        assert reason.endswith(words), reason
 
 
 def test_a_clock_that_jumps_back_stops_nothing(learned):
