@@ -239,7 +239,7 @@ class Status:
     fault: str
     beat: int  # counts up with each status that is published; the PLC's heartbeat echoes it
     closed: str = ""  # why the gap counts as closed; empty while it is open
-    trouble: str = ""  # why nobody knows what waits; empty: the pending ids are true
+    trouble: str = ""  # why nobody knows what waits; the pending ids are then as last known
 
 
 RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
@@ -277,6 +277,7 @@ class MaintenanceSession:
         self._conductor = Conductor(self._cell, self.memory, self._tell)
         self._reports = NodeReports(config)
         self._second = ""
+        self._pending = 0, 0, 0  # thermal, tool, fixture: what waited when it could be read last
 
     def beat(self, now_s: float) -> int:
         """The next beat, to be published now; 5 Hz. A heartbeat echoes it."""
@@ -483,13 +484,14 @@ class MaintenanceSession:
         cell, memory, running = self._cell, self.memory, self.running
         last = next(reversed(memory.cycles.values()), None)
         named = last.cycle_id if last is not None else ""
-        thermal, tool, fixture, trouble = 0, 0, 0, ""
+        trouble = ""
         try:
-            newest = [self._decider.newest(kind) for kind in (THERMAL, TOOL)]
-            newest.append(self._decider.newest_fixture())
+            newest = *map(self._decider.newest, (THERMAL, TOOL)), self._decider.newest_fixture()
             thermal, tool, fixture = (found.id if found else 0 for found in newest)
+            self._pending = thermal, tool, fixture
         except RobocalError as error:
             trouble = str(error)
+        thermal, tool, fixture = self._pending
         return Status(
             state=self.state,
             cycle_id=named if running is None else running.cycle_id,

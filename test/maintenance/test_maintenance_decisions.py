@@ -390,6 +390,18 @@ def test_a_fixture_that_was_put_back_waits_no_more(cell):
     assert cell.session.status(cell.now_s).fixture_pending == 0
 
 
+def test_what_waits_is_told_on_while_the_history_cannot_be_read(cell, tmp_path):
+    number = kept(cell.history, fixture_kind("plate"), {})
+    assert cell.session.status(cell.now_s).fixture_pending == number
+    cell.history.path.rename(tmp_path / "elsewhere")
+    status = cell.session.status(cell.now_s)
+    assert "deleted or replaced" in status.trouble
+    assert status.fixture_pending == number
+    (tmp_path / "elsewhere").rename(cell.history.path)
+    decide(cell, REJECT, number)
+    assert cell.session.status(cell.now_s).fixture_pending == 0
+
+
 def test_a_history_that_was_replaced_is_not_what_the_line_goes_by(history, tmp_path):
     cell = opened(history, drift=KNOWN, check=passed())
     cell.ran("c1")
