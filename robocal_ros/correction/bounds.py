@@ -51,6 +51,7 @@ from robocal_ros.correction.limiter import (
 from robocal_ros.correction.solution import MOST_STEPS, VELOCITY_EXACT
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array
+from robocal_ros.history.history_records import Past
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import payload_note, random_postures
 
@@ -442,7 +443,8 @@ class CorrectionGate:
         self._model: OfferedModel | None = None
         self._arm = reference  # that it says; the reference where it knows no drift
         self.revision: int | None = None  # of the model taken over
-        self._newest_ns = 0  # stamp of all that were taken over
+        self._head = 0  # revision in force by the history
+        self._newest_ns = 0  # stamp of all that were taken over, or were in force before
         self.survey = Survey(0.0, 0.0, 0.0)  # its correction over the joint range
         self.waiting: OfferedModel | None = None  # refused, and to be taken over if looked at again
         self._now_ns: int | None = None  # of the clock that stamps models, as it was told last
@@ -474,18 +476,20 @@ class CorrectionGate:
             detail = f"joints {model.joint_names}, this has {self._nominal.joint_names}"
             raise RefusedError(Reason.WRONG_ROBOT, detail)
         self.waiting = None
-        if self._model is not None and not again:
+        if not again:
             known = self._model
-            one, other = (pack_model(self._arm_of(m)) for m in (model, known))
-            if same_models(one, other, 0.0) and model.revision == known.revision:
-                self._use(model)
-                return
-            if not _later(model, known, self._newest_ns):
+            if known is not None:
+                one, other = (pack_model(self._arm_of(m)) for m in (model, known))
+                if same_models(one, other, 0.0) and model.revision == known.revision:
+                    self._use(model)
+                    return
+            if not _later(model, known, self._head, self._newest_ns):
                 self.waiting = model
+                after = f"{self._head} of the history" if known is None else f"{self.revision}"
                 raise RefusedError(
                     Reason.OLD_REVISION,
-                    f"revision {model.revision} with other numbers after {self.revision}, and not "
-                    "newer by its stamp; ~/take_over takes it over",
+                    f"revision {model.revision} with other numbers after {after}, and not newer by "
+                    "its stamp; ~/take_over takes it over",
                 )
         arm = self._arm_of(model)
         if len(places):
@@ -494,10 +498,11 @@ class CorrectionGate:
         self.payload = payload_note(arm, model.load, self._reference.load)
         self.survey = survey(self._reference, arm, self._config.thermal)
 
-    def know_past(self, model_ns: int, tool_ns: int) -> None:
-        """As if a model and a tool of these stamps had been taken over, and left again."""
-        self._newest_ns = max(self._newest_ns, model_ns)
-        self.tools.newest_ns = max(self.tools.newest_ns, tool_ns)
+    def know_past(self, model: Past, tool: Past) -> None:
+        """As if those before had been taken over, and left again."""
+        self._head, self.tools.head = model.revision, tool.revision
+        self._newest_ns = max(self._newest_ns, model.newest_ns)
+        self.tools.newest_ns = max(self.tools.newest_ns, tool.newest_ns)
 
     def _use(self, model: OfferedModel) -> None:
         self._model, self._arm, self.revision = model, self._arm_of(model), model.revision
@@ -593,7 +598,8 @@ class ToolGate:
         self.in_use: OfferedTool | None = None
         self.waiting: OfferedTool | None = None
         self.refused: OfferedTool | None = None
-        self.newest_ns = 0  # stamp of all that were taken
+        self.head = 0  # revision in force by the history
+        self.newest_ns = 0  # stamp of all that were taken, or were in force before
 
     @property
     def T_flange_tool(self) -> Array | None:
@@ -622,7 +628,7 @@ class ToolGate:
         self.refused = None
         last = self.waiting or self.in_use
         known = last is not None and _same_tool(tool, last)
-        later = last is None or _later(tool, last, self.newest_ns) or _retaught(tool, last)
+        later = _later(tool, last, self.head, self.newest_ns) or _retaught(tool, last)
         if not (known or later or again):
             self.refused = tool
             raise RefusedError(
@@ -656,12 +662,18 @@ def _same_tool(a: OfferedTool, b: OfferedTool) -> bool:
     return a.revision == b.revision and np.array_equal(a.T_flange_tool, b.T_flange_tool)
 
 
-def _retaught(a: OfferedTool, b: OfferedTool) -> bool:
+def _retaught(a: OfferedTool, b: OfferedTool | None) -> bool:
     """Whether one is told as the taught tool and the other is not, both of one revision."""
+    if b is None:
+        return False
     same = (a.revision, a.stamp_ns) == (b.revision, b.stamp_ns)
     return same and (a.T_flange_tool is None) != (b.T_flange_tool is None)
 
 
-def _later(a: OfferedCalibration, b: OfferedCalibration, newest_ns: int) -> bool:
-    """Whether one is newer than the last, whose own stamp is an old one after a rollback."""
-    return a.revision > b.revision or a.stamp_ns > newest_ns
+def _later(a: OfferedCalibration, b: OfferedCalibration | None, head: int, newest_ns: int) -> bool:
+    """Whether one is newer than the last, whose own stamp is an old one after a rollback.
+
+    The first is compared with the revision in force by the history.
+    """
+    newer = a.revision >= head if b is None else a.revision > b.revision
+    return newer or a.stamp_ns > newest_ns

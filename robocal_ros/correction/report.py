@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,12 +22,14 @@ from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
     CALIBRATED,
     NOMINAL,
     THERMAL,
     TOOL,
     CorrectionRecord,
+    Past,
 )
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import RobotDescription
@@ -59,8 +62,8 @@ class CorrectionLog:
 
     A thread of its own reads and writes: a disk that is slow, full or locked holds no command up.
     What cannot be written is told and tried again. ``fault`` says why something waits to be
-    written, ``damage`` what is wrong with a history that nobody has acknowledged. ``past_ns``:
-    stamps of the newest model and tool that were in force and, when a record was written, no more.
+    written, ``damage`` what is wrong with a history that nobody has acknowledged. ``past``: of
+    models and tools, as read at the beginning and with each record.
     """
 
     def __init__(self, settings: Mapping[str, Any], robot: RobotDescription) -> None:
@@ -69,7 +72,13 @@ class CorrectionLog:
         self._noted: queue.SimpleQueue[CorrectionRecord | str] = queue.SimpleQueue()
         self._waiting: deque[CorrectionRecord] = deque(maxlen=MOST_WAITING)
         self.fault = self.damage = ""
-        self.past_ns = 0, 0
+        self.past = Past(), Past()
+        # what fails is told by the thread, which tries again
+        with (
+            suppress(RobocalError, OSError),
+            open_history(settings, robot, owner=False)[1] as history,
+        ):
+            self._read_past(history)
         self._thread = threading.Thread(target=self._run, name="correction_log", daemon=True)
         self._thread.start()
 
@@ -87,6 +96,9 @@ class CorrectionLog:
         """Write what waits, if that is possible soon."""
         self._noted.put(END)
         self._thread.join(CLOSE_S)
+
+    def _read_past(self, history: CalibrationHistory) -> None:
+        self.past = history.past(THERMAL), history.past(TOOL)
 
     def _run(self) -> None:
         noted: CorrectionRecord | str = ""
@@ -107,7 +119,7 @@ class CorrectionLog:
                 self.damage = ""
             if self._waiting:
                 with open_history(self._settings, self._robot, owner=False)[1] as history:
-                    self.past_ns = history.newest_past_ns(THERMAL), history.newest_past_ns(TOOL)
+                    self._read_past(history)
                     while self._waiting:
                         history.note_correction(self._waiting[0])
                         self._waiting.popleft()
@@ -154,6 +166,7 @@ class CorrectionReport:
             taught_tool=(*T[:3, 3].tolist(), *frames.quat_xyzw(T).tolist()),
         )
         self.log = CorrectionLog(settings, robot)
+        session.know_past(*self.log.past)
 
     def offset(self, cause: int, now_s: float) -> None:
         """Publish what is added to the taught joints, while somebody subscribes.
@@ -184,7 +197,7 @@ class CorrectionReport:
         ``commanders``: who else commands; ``lease``: who holds one; empty where nobody does.
         """
         now = time.monotonic()
-        self._session.know_past(*self.log.past_ns)
+        self._session.know_past(*self.log.past)
         status = self._session.status(now)
         message = self._message(status)
         message.commanders, message.lease, message.history = commanders, lease, self.log.damage

@@ -58,6 +58,7 @@ from robocal_ros.ground.serialized import (
     point_places,
     scatter_rows,
 )
+from robocal_ros.history.history_records import Past
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.robot_watch import Lateness
 
@@ -198,12 +199,9 @@ class CorrectionSession:
         if not np.isfinite(self._goal).any():
             self._adopt_tool()
 
-    def know_past(self, model_ns: int, tool_ns: int) -> None:
-        """Stamps of the newest model and tool that were in force once; 0: none is known.
-
-        What was rolled back before this session does not come into use by an old message either.
-        """
-        self._gate.know_past(model_ns, tool_ns)
+    def know_past(self, model: Past, tool: Past) -> None:
+        """Tell what was in force before this session: no old message of it comes into use."""
+        self._gate.know_past(model, tool)
 
     def look(self, now_s: float, now_ns: int) -> None:
         """To be called now and then: a tool waits for a robot that stands, a model grows old.

@@ -43,6 +43,7 @@ from robocal_ros.history.history_records import (
     Decision,
     Entry,
     Head,
+    Past,
     read_arrays,
     read_candidate,
     read_candidates,
@@ -444,12 +445,12 @@ class HistoryReader:
         with self._reading() as connection:
             return read_decisions(connection, after_seq, newest)
 
-    def newest_past_ns(self, kind: str) -> int:
-        """Stamp of the newest that was in force and is so no more; 0 without any."""
+    def past(self, kind: str) -> Past:
+        """What came before what is in force."""
         with self._reading() as connection:
-            in_force = self._ledger.head(kind)[1] or 0
-            (newest,) = connection.execute(_PAST, (kind, in_force, Action.ACCEPT)).fetchone()
-            return int(newest or 0)
+            revision, in_force = self._ledger.head(kind)
+            told = connection.execute(_PAST, (kind, in_force or 0, Action.ACCEPT))
+            return Past(revision, int(told.fetchone()[0] or 0))
 
     def corrections(self, limit: int = 50) -> tuple[CorrectionRecord, ...]:
         """What the robot's commands were corrected with, newest first."""

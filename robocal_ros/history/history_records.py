@@ -181,6 +181,17 @@ class Head:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+@dataclass(frozen=True, slots=True)
+class Past:
+    """What an old message is known by: the ``revision`` in force, and the newest stamp of what was.
+
+    ``newest_ns`` is of those that are in force no more; 0 without any.
+    """
+
+    revision: int = 0
+    newest_ns: int = 0
+
+
 @dataclass(frozen=True, kw_only=True)
 class Entry(Candidate):
     """A calibration in the history, with where it stands.

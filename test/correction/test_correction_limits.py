@@ -32,6 +32,7 @@ from robocal_ros.correction.interface import JointCommand, Reason, TrajectoryCom
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
+from robocal_ros.history.history_records import Past
 
 
 def test_joint_limits_hold_after_the_correction(warm: Robot) -> None:
@@ -174,9 +175,10 @@ def test_a_model_that_was_rolled_back_stays_so_where_its_message_is_repeated() -
 
 def test_a_model_that_was_rolled_back_before_the_session_stays_so_where_it_is_repeated() -> None:
     robot = Robot()
-    robot.session.know_past(200, 0)
-    robot.session.offer_model(offer(NOMINAL, 9))
-    refused(Reason.OLD_REVISION, robot.session.offer_model, offer(drifted(), 7, stamp_ns=200))
+    robot.session.know_past(Past(9, 200), Past())
+    for _ in range(2):  # as the first one, and after the one in force
+        refused(Reason.OLD_REVISION, robot.session.offer_model, offer(drifted(), 7, stamp_ns=200))
+        robot.session.offer_model(offer(NOMINAL, 9))
     assert robot.session.status().revision == 9
     robot.session.offer_model(offer(drifted(), 7, stamp_ns=201))  # the history began again
     assert robot.session.status().revision == 7

@@ -14,6 +14,7 @@ from robocal_ros.correction.interface import (
     TrajectoryCommand,
     offered_tool,
 )
+from robocal_ros.history.history_records import Past
 
 
 def waiting(robot: Robot) -> int | None:
@@ -158,9 +159,10 @@ def test_a_tool_that_was_rolled_back_stays_so_where_its_message_is_repeated(robo
 
 
 def test_a_tool_that_was_rolled_back_before_the_session_stays_so(robot: Robot) -> None:
-    robot.session.know_past(0, 200)
-    robot.change_tool(bent_tool(revision=7, T_flange_tool=None))
-    refused(Reason.OLD_REVISION, robot.session.offer_tool, bent_tool(revision=5, stamp_ns=200))
+    robot.session.know_past(Past(), Past(7, 200))
+    for _ in range(2):  # as the first one, and after the one in force
+        refused(Reason.OLD_REVISION, robot.session.offer_tool, bent_tool(revision=5, stamp_ns=200))
+        robot.change_tool(bent_tool(revision=7, T_flange_tool=None))
     assert not robot.session.status().new_tool
 
 

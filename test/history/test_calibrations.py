@@ -12,7 +12,7 @@ from history_workers import proposal
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import Action, CalibrationState, Head
+from robocal_ros.history.history_records import Action, CalibrationState, Head, Past
 from robocal_ros.session.events import ACCEPT, ONLY, Command, named
 
 
@@ -220,14 +220,15 @@ class TestDecisions:
         for revision, stamp_ns in enumerate((30, 40, 20)):
             number = history.propose(proposal(based_on=revision, stamp_ns=stamp_ns))
             history.accept(number, **BY)
-            past.append(history.newest_past_ns("thermal"))
+            past.append(history.past("thermal").newest_ns)
         history.propose(proposal(based_on=3, stamp_ns=50))
         assert past == [0, 30, 40]
         for _ in range(2):
             history.rollback(**BY)
-            past.append(history.newest_past_ns("thermal"))
+            past.append(history.past("thermal").newest_ns)
         assert past[3:] == [30, 40]
-        assert history.newest_past_ns("tool") == 0
+        assert history.past("thermal").revision == 5
+        assert history.past("tool") == Past()
 
     def test_what_needs_another_kind_beside_it(self, history: CalibrationHistory) -> None:
         thermal = history.propose(proposal())

@@ -92,9 +92,9 @@ def test_what_the_history_has_rolled_back_stays_so_where_its_message_is_repeated
         history.accept(history.propose(proposal(**made)), **by)
         history.rollback(0, **by)
     line = Line(graph)
-    after(graph, 1)
-    line.take(model_message(NOMINAL, 2), line.to_model, "kinematic_model")
     withdrawn = model_message(drifted(), 1, stamp=header(stamp_ns, "base"))
+    line.refused(line.to_model, withdrawn, "kinematic_model")  # as the first one, too
+    line.take(model_message(NOMINAL, 2), line.to_model, "kinematic_model")
     line.refused(line.to_model, withdrawn, "kinematic_model")
     told = line.told(model_waits=True)
     assert (told.model_revision, told.waiting_model_revision) == (2, 1)
