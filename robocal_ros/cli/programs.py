@@ -37,7 +37,6 @@ from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
 from robocal_ros.programs.conventions import COUNT, base_text, tool_text
 from robocal_ros.programs.correcting import (
-    LEAST_M,
     STATES,
     CorrectionModels,
     ProgramCorrection,
@@ -69,6 +68,7 @@ _MODEL = (
     "robot file of the robot as identified, or what 'robocal history show --json' prints of a "
     "calibration"
 )
+SAME_M, SAME_RAD = 1e-6, 2e-5  # of one frame in two files that round it, to 0.001 mm and deg
 _EXAMPLE = """example:
   robocal correct-program weld.dat --robot kr150_r3100 --model identified.yaml \\
       --frames '$config.dat' --output corrected/weld.dat
@@ -337,15 +337,18 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
 def _given_frames(args: argparse.Namespace, dialect: Dialect, program: str) -> dict[str, Array]:
     """Tools and bases that ``--frame`` names, beside them those of the program and ``--frames``.
 
-    Raises `InputError` where two of the latter differ and nothing says which is meant.
+    Raises `InputError` where two of the latter differ in one that points ask for, and nothing says
+    which is meant.
     """
     named = dict(frame_given(dialect.maker, words) for words in args.frame)
-    settled = {name.lower() for name in named}
-    known = dict(dialect.read(program).frames) if args.frames else {}
+    read = dialect.read(program)
+    ends = [args.tool, args.base, *(name for p in read.points for name in (p.tool, p.frame))]
+    asked = {name.lower() for name in ends if name} - {name.lower() for name in named}
+    known = dict(read.frames) if args.frames else {}
     for path in args.frames:
         for name, T in _frames_of(path, dialect).items():
-            first = known.setdefault(name, T)
-            if name.lower() not in settled and not np.allclose(first, T, rtol=0.0, atol=LEAST_M):
+            off_m, off_rad = frames.apart(known.setdefault(name, T), T)
+            if name.lower() in asked and (off_m > SAME_M or off_rad > SAME_RAD):
                 words = f"{name} is another one than in the program, or in the file before"
                 raise InputError(f"{words}: say by --frame '{name}=…' which holds", file=str(path))
     return known | named

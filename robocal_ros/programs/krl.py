@@ -60,7 +60,9 @@ _MOVED = re.compile(
 _NAME = r"(\w+(?:\[\w+\])?)"
 _USED = re.compile(rf"\b{MOVES}(?:\s+{_NAME}|\s*\{{[^{{}}]*\}})(?:\s*,\s*{_NAME})?", re.I)
 _INDEXED = r"(\w+(?:\[\d+\])?)(?:\[[^\]\r\n]*\])?"
-_RELATIVE = re.compile(rf"\b{MOVES}_REL\s+{_INDEXED}(?:\s*,\s*{_INDEXED})?", re.I)
+_RELATIVE = re.compile(
+    rf"\b{MOVES}_REL(?:\s+{_INDEXED}|\s*\{{[^{{}}]*\}})(?:\s*,\s*{_INDEXED})?", re.I
+)
 _DECLARED = re.compile(
     r"\b(?:E6POS|POS|E6AXIS|AXIS)\s+((?:\w+(?:\[[^\]\r\n]*\])?[ \t]*,?[ \t]*)+)", re.I
 )
@@ -101,7 +103,8 @@ _COMPUTED = re.compile(
 )
 _CHANGED = re.compile(
     rf"^[ \t]*[A-Z]\w*(?:\[[^\]\r\n]*\])?\s*=(?!=){_PRODUCT}[^\r\n]*"
-    r"|\b(?:TOOL|BASE)_DATA\[[^\]\r\n]*\](?:\.\w+)?\s*=(?![\s=]*\{)[^\r\n]*"
+    r"|\b(?:TOOL|BASE)_DATA\[(?:\d+\](?:\.\w+)?\s*=(?![\s=]*\{)"
+    r"|(?!\d+\])[^\]\r\n]*\](?:\.\w+)?\s*=(?!=))[^\r\n]*"
     r"|\$(?:TOOL|BASE)\.\w+\s*=(?!=)[^\r\n]*"
     r"|(?<![$\w])[A-Z]\w*(?:\[[^\]\r\n]*\])?\.(?:[XYZABC]|A[1-6])\s*=(?!=)[^\r\n]*",
     re.I | re.M,
@@ -120,7 +123,7 @@ class KrlDialect(Dialect):
         clean = masked(text, ";")
         frames = {"TOOL_DATA[0]": np.eye(4), "BASE_DATA[0]": np.eye(4)}
         frames |= {name: np.eye(4) for name in ROBROOT}
-        numbered, again = _numbered_frames(text, clean)
+        numbered, unsettled = _numbered_frames(text, clean)
         frames |= numbered
         inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
         flow, within = _flow(text, clean, frames, inline), _withs(text, clean, frames, inline)
@@ -139,8 +142,9 @@ class KrlDialect(Dialect):
                 continue
             point = _framed(point, braces.start(), inline, flow, within)
             if not point.joints:
-                moves = again.get(point.tool or "") or again.get(point.frame or "", "")
-                point = replace(point, problem=point.problem or moves)
+                tool = unsettled.get(point.tool or "", point.tool)
+                frame = unsettled.get(point.frame or "", point.frame)
+                point = replace(point, tool=tool, frame=frame)
             name = point.name.upper()
             if line := reckoned.get(name, reckoned.get(name.partition("[")[0])):
                 problem = f"the program reckons with it in line {line}"
@@ -197,16 +201,17 @@ def _frame(body: str) -> Array | None:
 
 
 def _numbered_frames(text: str, clean: str) -> tuple[dict[str, Array], dict[str, str]]:
-    """TOOL_DATA and BASE_DATA that the text gives; why those that it gives anew are unknown."""
-    values: dict[str, Array | None] = {}
-    again: dict[str, str] = {}
+    """TOOL_DATA and BASE_DATA that the text gives; those of which it does not give one value.
+
+    These have the line where that shows in their names, as what is unknown at run time.
+    """
+    known: dict[str, Array] = {}
+    unsettled: dict[str, str] = {}
     for found in _FRAME_DATA.finditer(clean):
         name, T = f"{found[1].upper()}[{found[2]}]", _frame(found[3] or "")
-        first = values.setdefault(name, T)
-        if first is not T and (first is None or T is None or not np.array_equal(first, T)):
-            again.setdefault(name, f"{name} is set again in line {line_of(text, found.start())}")
-    known = {name: T for name, T in values.items() if T is not None and name not in again}
-    return known, again
+        if T is None or not np.array_equal(known.setdefault(name, T), T):
+            unsettled.setdefault(name, f"{name}{OF_LINE}{line_of(text, found.start())}")
+    return {name: T for name, T in known.items() if name not in unsettled}, unsettled
 
 
 def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> ProgramPoint | None:

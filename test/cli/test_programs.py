@@ -160,6 +160,12 @@ def test_a_frame_of_two_values_is_refused_until_it_is_named(folder: Path, capsys
     for program, given in (("weld.dat", two), ("own.dat", KNOWN)):
         _, document = command(capsys, program, *MODEL, *given, *named)
         assert document["points"] == expected["points"]
+    unused = "BASE_DATA[9]={X 1,Y 0,Z 0,A 0,B 0,C 0}\n"
+    (folder / "$config.dat").write_text(KUKA_FRAMES + unused)
+    rounded = KUKA_FRAMES.replace("X 900.0", "X 900.0004") + unused.replace("X 1", "X 2")
+    (folder / "other.dat").write_text(rounded)
+    _, document = command(capsys, "weld.dat", *MODEL, *two)
+    assert document["points"] == expected["points"]
 
 
 def test_a_file_without_frames_is_refused_where_frames_are_wanted(folder: Path, capsys):

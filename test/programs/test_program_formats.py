@@ -199,10 +199,11 @@ POINT = "{X 1,Y 2,Z 3,A 0,B 0,C 0}"
         (f"DECL POS XP2\nXP2={POINT}:XP1\nXP2=XP1:{POINT}", {}, [4, 5]),
         ("DECL POS XP2={POS: X 1,Y 2,Z 3,A 0,B 0,C 0}\nLIN XP2", {"XP2": ""}, []),
         (
-            f"DECL POS WAY={POINT}\nDECL E6POS XP1={POINT}\nLIN_REL WAY\nCIRC_REL XP1,WAY",
+            f"DECL POS WAY={POINT}\nDECL E6POS XP1={POINT}\nLIN_REL WAY\nCIRC_REL {POINT},XP1",
             {
                 "WAY": "the program reckons with it in line 5",
                 "XP1": "the program reckons with it in line 6",
+                "CIRC_REL in line 6": "is relative to the point before",
             },
             [],
         ),
@@ -239,18 +240,25 @@ def test_a_base_that_is_a_product_is_unknown():
         assert "$BASE of line 1" not in found.frames
 
 
-def test_a_base_that_the_program_sets_anew_is_unknown():
-    """Whole or in part; the same once more is no other, and joints do without."""
+def test_a_base_of_which_the_program_gives_no_one_value_is_unknown():
+    """Set anew, whole or in part, or in part alone; once more the same is no other."""
     text = (
         f"BASE_DATA[1]={POINT}\nBASE_DATA[2]={POINT}\nBASE_DATA[3]={POINT}\n"
         f"BASE_DATA[1]={POINT}\nBASE_DATA[2]={POINT.replace('X 1', 'X 9')}\nBASE_DATA[3].Z=5\n"
+        "BASE_DATA[4].Z=5\nBASE_DATA[4].X=I\n"
     )
-    text += "".join(f"$BASE=BASE_DATA[{n}]\nLIN {POINT}\n" for n in (1, 2, 3))
-    found = dialect_of(".src").read(f"{text}PTP {{A1 0,A2 -90,A3 90,A4 0,A5 30,A6 0}}\n")
-    assert [point.problem for point in found.points] == [
-        "", "BASE_DATA[2] is set again in line 5", "BASE_DATA[3] is set again in line 6", "",
+    text += "".join(f"$BASE=BASE_DATA[{n}]\nLIN {POINT}\n" for n in (1, 2, 3, 4))
+    found = dialect_of(".src").read(text)
+    assert [point.frame for point in found.points] == [
+        "BASE_DATA[1]", "BASE_DATA[2] of line 5", "BASE_DATA[3] of line 6",
+        "BASE_DATA[4] of line 7",
     ]  # fmt: skip
-    assert found.frames.keys() & {f"BASE_DATA[{n}]" for n in (1, 2, 3)} == {"BASE_DATA[1]"}
+    assert found.frames.keys() & {f"BASE_DATA[{n}]" for n in (1, 2, 3, 4)} == {"BASE_DATA[1]"}
+
+
+def test_a_base_by_a_number_that_runs_is_told():
+    text = f"BASE_DATA[NR]={POINT}\nBASE_DATA[1]={POINT}\n$BASE=BASE_DATA[NR]\n"
+    assert [line for line, _ in dialect_of(".src").read(text).computed] == [1]
 
 
 def test_points_in_an_array_are_found_whatever_counts_them():
