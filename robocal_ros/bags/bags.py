@@ -276,7 +276,7 @@ def _bag_files(path: Path) -> tuple[list[Path], list[str]]:
         described = content["rosbag2_bagfile_information"]
         storage, mode = described["storage_identifier"], described.get("compression_mode", "")
         names = [str(name) for name in described["relative_file_paths"]]
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(
             "this is not the metadata of a bag; 'ros2 bag reindex' makes it anew",
             file=str(metadata),

@@ -480,13 +480,6 @@ def fit_sphere(points: Array, rule: SphereRule) -> SphereFit:
         raise TooFewSamplesError(
             f"{len(cloud)} points give no sphere's centre: at least {FEWEST_ON_CAP} are needed"
         )
-    thin, wide, _ = np.linalg.eigvalsh(np.cov(cloud.T))
-    if thin < (_THIN * rule.radius_m) ** 2 < wide:
-        raise RankDeficientError(
-            "the points lie in one plane, and do not tell a sphere's centre: send a cap, as an "
-            "area scanner sees it; profiles of a line laser are for hand_eye_node",
-            ("the centre, across that plane",),
-        )
     for triples, judges in _EFFORTS:
         try:
             centre, near = _refine(cloud, _start(cloud, rule, triples, judges), rule)
@@ -494,6 +487,13 @@ def fit_sphere(points: Array, rule: SphereRule) -> SphereFit:
         except TooFewSamplesError:
             if (triples, judges) == _EFFORTS[-1]:
                 raise
+    thin, wide, _ = np.linalg.eigvalsh(np.cov(cloud[near].T))
+    if thin < (_THIN * rule.radius_m) ** 2 < wide:
+        raise RankDeficientError(
+            "the points lie in one plane, which does not tell a sphere's centre: a cap must be "
+            "seen, as by an area scanner, or by a line laser in several profiles",
+            ("the centre, across that plane",),
+        )
     fit = _report(cloud, centre, near, finite)
     _require_sphere(fit, rule)
     return fit

@@ -320,7 +320,7 @@ def see_boards(
 
     ``unread``: name of each image that cannot be read, with the reason.
     """
-    rejected = dict(unread or {})
+    rejected: dict[str, str] = {}
     sizes = [(image.shape[1], image.shape[0]) for _, image in images]
     size = intrinsics.size if intrinsics else max(sizes, key=sizes.count, default=(0, 0))
     names, corners = [], []
@@ -336,7 +336,7 @@ def see_boards(
         else:
             names.append(name)
             corners.append(found)
-    return boards_of_corners(names, corners, board, size, intrinsics, rejected)
+    return boards_of_corners(names, corners, board, size, intrinsics, rejected | (unread or {}))
 
 
 def boards_of_corners(

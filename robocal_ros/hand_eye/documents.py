@@ -78,7 +78,7 @@ class LinearityDocument(TypedDict):
 
     degree: NotNegative
     rms_um: Annotated[NotNegative, "Of its form as the profiles alone show it, without the scale."]
-    max_um: Annotated[NotNegative, "The same."]
+    max_um: Annotated[NotNegative, "The largest of that form."]
     residual_um: NotNegative
     left_out_um: NotNegative
     coefficients_um: Annotated[

@@ -60,8 +60,11 @@ def load_yaml(text: str, file: str) -> Any:
     except yaml.MarkedYAMLError as error:
         row = error.problem_mark.line + 1 if error.problem_mark else None
         raise InputError(f"not valid YAML: {error.problem}", file=file, row=row) from error
-    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"not valid YAML: {error}", file=file) from error
+    except (TypeError, KeyError, AttributeError) as error:  # PyYAML's own, of a value with a tag
+        words = "a value is none of the kind that its tag names"
+        raise InputError(f"not valid YAML: {words}", file=file) from error
 
 
 class Fields:

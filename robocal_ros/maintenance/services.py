@@ -297,7 +297,7 @@ class MaintenanceServices:
         if session.running is not None:
             return waiting, Code.NONE, status.doing
         if status.trouble:
-            return 0, Code.STORAGE_FAILED, status.trouble
+            return waiting, Code.STORAGE_FAILED, status.trouble
         if status.last is None:
             return waiting, Code.CONFLICT, "no cycle has ended yet"
         return waiting, status.last.code, session.memory.words_of(status.last)

@@ -173,7 +173,7 @@ SHOWN = (
     Shown(
         "Candidates",
         STATUS,
-        "What waits for a decision; 0: nothing",
+        "What waits for a decision, as last known; 0: nothing",
         (
             Item("ThermalId", "UInt32", "thermal_pending", "Newest thermal candidate"),
             Item("ToolId", "UInt32", "tool_pending", "Newest tool candidate"),

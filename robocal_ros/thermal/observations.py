@@ -546,6 +546,8 @@ class MotorTemperatures:
 
     def at(self, stamp_ns: int, until_ns: int | None = None) -> Array | None:
         """Temperatures (n,) at a stamp, as read up to another one; None where not known."""
+        if self.silent(stamp_ns, until_ns):
+            return None
         found = self.between(stamp_ns - SILENT_NS, stamp_ns if until_ns is None else until_ns)
         return found[-1][1] if found else None
 

@@ -224,7 +224,9 @@ class Proposer:
             found = identify_subset(spots, data, names, sigma_m=config.sigma_m)
             judged = judge_cycle(found, spots, in_force=in_force, sigma_m=config.sigma_m)
         verdict = judged.verdict
-        for words in filter(None, (other_sides(spots, data), follower.unread(beside.silent))):
+        # what moved is told on until the next cycle; a motor may speak again before
+        unread = "" if follower.state.moved else follower.unread(beside.silent)
+        for words in filter(None, (other_sides(spots, data), unread)):
             verdict = replace(verdict, reason=f"{verdict.reason}; {words}")
         judged = replace(judged, verdict=verdict)
         model = (

@@ -546,7 +546,8 @@ class ToolSession(SessionBase):
         now = self.current
         tool = log.solve(now.arm, now.tool, now.thermal.revision)
         outcome = self._results.by_hand(tool, command, wall_ns)
-        if log is self._touches and not outcome.done:  # more of them may mend it; of sweeps, none
+        # more touches may mend it; more of a wrong tool, or more sweeps, do not
+        if log is self._touches and outcome.status is Code.RESIDUAL_TOO_LARGE:
             words = f"{outcome.message}; the {tool.samples} touches stay: add others, or clear them"
             return replace(outcome, message=words)
         log.clear(command)

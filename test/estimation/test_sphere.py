@@ -130,6 +130,8 @@ def test_a_profile_of_a_line_laser_is_no_cap():
     depth = np.sqrt(RADIUS**2 - 0.009**2 - x**2) + 2e-5 * rng(7).standard_normal(len(x))
     profile = np.column_stack([x, 0.0 * x, 0.2 - depth])
     turned = profile @ frames.exp_rotation([0.3, -1.0, 0.5]).T + CENTRE
-    for cloud in (profile, turned.astype(np.float32)):
-        with pytest.raises(RankDeficientError, match=r"lie in one plane.*for hand_eye_node"):
+    no_return = [[1e10, 0.0, 0.0], [3.4e38, 1.0, 0.0]]
+    beside = np.vstack([turned, no_return])
+    for cloud in (profile, turned.astype(np.float32), beside):
+        with pytest.raises(RankDeficientError, match=r"lie in one plane.*a cap must be seen"):
             fit_sphere(cloud, RULE)

@@ -2,6 +2,7 @@
 """What a robot's own history teaches, with and without motor temperatures."""
 
 from pathlib import Path
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -51,6 +52,14 @@ class Robot(DriftingRobot):
         self.feed(self.shift.visit(warmed(self.cold, kelvin), self.q))
         return self.ask(command)
 
+    def morning(self) -> Outcome:
+        """A cold reference, which it returns, and three cycles."""
+        captured = self.visit(events.CAPTURE_REFERENCE, 0.0, 12.0)
+        assert captured.done
+        for kelvin in (4.0, 7.0, 9.0):
+            assert self.visit(events.IDENTIFY, kelvin, 0.3).calibration_id
+        return captured
+
     def work(self, highest_k: float) -> list[Outcome]:
         """A night's rest, a cold reference, and a shift that warms up."""
         assert self.visit(events.CAPTURE_REFERENCE, 0.0, 12.0).done
@@ -99,11 +108,21 @@ def test_what_was_rolled_back_or_rejected_teaches_nothing(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory) -> Robot:
-    """Three shifts with temperatures, then a session that has learned from them."""
-    robot = Robot(tmp_path_factory.mktemp("learned"), temperatures=True)
+def shifts(tmp_path_factory) -> Robot:
+    """Three of them with temperatures."""
+    robot = Robot(tmp_path_factory.mktemp("shifts"), temperatures=True)
     for highest in (12.0, 20.0, 16.0):
         robot.work(highest)
+    robot.history.close()
+    return robot
+
+
+@pytest.fixture
+def learned(shifts, tmp_path) -> Robot:
+    """A session that has learned from them."""
+    copytree(shifts.folder, tmp_path, dirs_exist_ok=True)
+    robot = Robot(tmp_path, temperatures=True)
+    robot.shift.now_ns = shifts.shift.now_ns
     robot.start("learned")
     return robot
 
@@ -128,10 +147,7 @@ def test_a_motor_that_was_not_read_when_cold_hides_no_drift(learned):
 def test_temperatures_tell_the_drift_between_cycles(learned):
     """Warmer by 6 K since the last cycle, as only the motors tell: most of that drift is seen."""
     session = learned.session
-    captured = learned.visit(events.CAPTURE_REFERENCE, 0.0, 12.0)
-    assert "learned with temperatures from 3 shifts" in captured.message
-    for kelvin in (4.0, 7.0, 9.0):
-        assert learned.visit(events.IDENTIFY, kelvin, 0.3).calibration_id
+    assert "learned with temperatures from 3 shifts" in learned.morning().message
     follower = session.follower
     assert follower is not None
     learned.shift.now_ns += 1800 * NS
@@ -151,6 +167,7 @@ def test_temperatures_tell_the_drift_between_cycles(learned):
 
 
 def test_a_restart_keeps_the_temperatures_course(learned):
+    learned.morning()
     state = learned.session.follower.state
     session = learned.start("learned")
     again = session.follower.state
@@ -163,6 +180,7 @@ def test_a_restart_keeps_the_temperatures_course(learned):
 
 def test_silent_temperatures_cost_certainty_and_not_the_cycle(learned):
     """An hour without a reading: the cycle counts, and less is known than with readings."""
+    learned.morning()
     follower = learned.session.follower
     forecast = follower.forecast(learned.session.current.arm)
     _, before = forecast.drift_at(follower.time_s(learned.shift.now_ns))
@@ -197,6 +215,7 @@ def test_a_motor_that_falls_silent_is_named_by_accuracy_and_cycle(learned):
 
 def test_a_clock_that_jumps_back_stops_nothing(learned):
     """With temperatures: cycles go on, and accuracy ages on the new clock."""
+    learned.morning()
     learned.shift.now_ns -= 6 * 3600 * NS
     statuses = [learned.visit(events.IDENTIFY, 9.0, 0.2).status.name for _ in range(3)]
     assert "STALE" not in statuses
@@ -237,3 +256,12 @@ def test_one_motor_that_is_never_read_fills_no_memory():
         found.add(TemperatureSample(i * 10 * NS + 1, "a", 30.0))
     assert found.at(250_000 * NS) is None
     assert len(found._kept) <= 20_000
+
+
+def test_no_temperatures_are_known_while_a_motor_is_silent():
+    """However young the others' are; who asks is told the same by both."""
+    found = MotorTemperatures(("a", "b"))
+    found.add(TemperatureSample(600 * NS, "a", 20.0))
+    found.add(TemperatureSample(1200 * NS, "b", 30.0))
+    assert (found.at(1400 * NS).tolist(), found.silent(1400 * NS)) == ([20.0, 30.0], ())
+    assert (found.at(1600 * NS), found.silent(1600 * NS)) == (None, ("a",))

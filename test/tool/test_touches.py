@@ -86,11 +86,20 @@ def test_a_tool_far_from_the_taught_one_is_not_proposed_as_good(driver):
     far = TRUTH.copy()
     far[:3, 3] += [0.02, 0.0, 0.0]
     touched(driver, far, 8)
+    assert driver.command(Command(SOLVE_TOUCHES, {})).status is Code.LIMIT_EXCEEDED
+    assert driver.command(Command(CLEAR_TOUCHES, {})).message == "0 touches are forgotten"
+
+
+def test_touches_that_contradict_each_other_stay_for_others_to_be_added(driver):
+    touched(driver, TRUTH, 3)
+    other = TRUTH.copy()
+    other[:3, 3] += [0.0, 0.006, 0.0]
+    touched(driver, other, 3, tilt_rad=0.3)
     for _ in range(2):  # nothing is forgotten with the first answer
         refused = driver.command(Command(SOLVE_TOUCHES, {}))
-        assert (refused.status, refused.samples) == (Code.LIMIT_EXCEEDED, 8)
-        assert refused.message.endswith("the 8 touches stay: add others, or clear them")
-    assert driver.command(Command(CLEAR_TOUCHES, {})).message == "8 touches are forgotten"
+        assert (refused.status, refused.samples) == (Code.RESIDUAL_TOO_LARGE, 6)
+        assert refused.message.endswith("the 6 touches stay: add others, or clear them")
+    assert driver.command(Command(CLEAR_TOUCHES, {})).message == "6 touches are forgotten"
 
 
 def test_the_golden_bag_gives_its_session_again():
