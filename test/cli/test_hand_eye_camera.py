@@ -267,7 +267,7 @@ def test_where_none_can_be_read_it_is_said_why_no_image_shows_the_board(
         (tmp_path / image.name).write_bytes(image.read_bytes())
     other = ("--board", "8x5", "--square-mm", "25")
     document = robocal("--poses", "image_poses.csv", "--images", tmp_path, *other, status=3)
-    assert "no 8x5" in document["error"]["message"]  # what hides it in all others
+    assert "no board of 8x5" in document["error"]["message"]  # what hides it in all others
 
 
 def test_people_read_it_too(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
