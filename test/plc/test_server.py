@@ -111,7 +111,7 @@ def test_connections_that_say_nothing_are_few_and_are_cut_off(served: Served) ->
     """A PLC finds its place among them, from their address too."""
     silent = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(60)]
     served.works()
-    other = PlcClient(served.folder, served.port)
+    other = PlcClient(served.folder, served.port, "ada")
     other.do(other.connect())
     other.close()
     until_s = time.monotonic() + 15.0
@@ -281,6 +281,7 @@ def test_a_client_that_connects_again_leaves_no_session(
 
 
 def test_a_call_that_nobody_answers_ends_in_time(served: Served) -> None:
+    served.forget()
     began_s = time.monotonic()
     with pytest.raises(ua.UaStatusCodeError) as caught:
         served.plc.do(served.plc.call("Run", "4711", 30.0))
