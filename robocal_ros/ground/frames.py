@@ -2,8 +2,8 @@
 """Rigid transforms as 4 x 4 arrays, batched in the leading dimensions.
 
 ``T_a_b`` maps coordinates in frame b to frame a: ``p_a = T_a_b @ p_b``.
-Quaternions are x, y, z, w. scipy's rotations are loaded when they are first used: a fifth of a
-second that the start of a node does not need, which is why quaternions do without them.
+Quaternions are x, y, z, w. Nothing here needs scipy.spatial, whose import takes a node a tenth of a
+second at its start.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -42,9 +42,14 @@ def transform_from_quat(xyz: ArrayLike, quat_xyzw: ArrayLike) -> Array:
     length = np.linalg.norm(quat, axis=-1, keepdims=True)
     if np.any(length == 0.0):
         raise ValueError("a quaternion has the length 0")
-    v, w = (quat / length)[..., :3], (quat / length)[..., 3, None, None]
+    unit = quat / length
+    return transform(_rotation_of_quat(unit[..., :3], unit[..., 3:]), xyz)
+
+
+def _rotation_of_quat(v: Array, w: Array) -> Array:
+    """Rotations (..., 3, 3) of unit quaternions: vectors (..., 3) and real parts (..., 1)."""
     V = skew(v)
-    return transform(np.eye(3) + 2.0 * (w * V + V @ V), xyz)
+    return np.asarray(np.eye(3) + 2.0 * (w[..., None] * V + V @ V))
 
 
 def invert(T: Array) -> Array:
@@ -81,18 +86,17 @@ def quat_xyzw(T: Array) -> Array:
 
 def exp_rotation(rotvec: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
-    from scipy.spatial.transform import Rotation
-
-    w = np.array(rotvec, dtype=np.float64)  # a copy: SciPy 1.11 takes none that is read-only
-    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape, 3))
+    w = np.asarray(rotvec, dtype=np.float64)
+    half = 0.5 * np.linalg.norm(w, axis=-1, keepdims=True)
+    return _rotation_of_quat(0.5 * np.sinc(half / np.pi) * w, np.cos(half))
 
 
 def log_rotation(rotation: Array) -> Array:
-    """Rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    R = np.array(rotation, dtype=np.float64)  # a copy: SciPy 1.11 takes none that is read-only
-    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]))
+    """Rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3); no longer than pi."""
+    quat = quat_xyzw(rotation)
+    v, w = quat[..., :3], quat[..., 3:]
+    half = np.arctan2(np.linalg.norm(v, axis=-1, keepdims=True), w)
+    return np.asarray(2.0 / np.sinc(half / np.pi) * v)
 
 
 def apart(T: Array, other: Array) -> tuple[float, float]:

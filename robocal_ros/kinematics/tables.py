@@ -12,7 +12,6 @@ from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
@@ -551,22 +550,19 @@ def read_rotations(table: Cells, kind: tuple[str, ...]) -> Array:
     Raises `InputError` when a quaternion is not of unit length.
     """
     values = np.column_stack([table.numbers(name) for name in kind])
-    if kind == EULER:
-        # intrinsic XYZ: turn about x, then about the new y, then about the new z
-        rotations = Rotation.from_euler("XYZ", values, degrees=True)
-    elif kind == FANUC:
-        # about the fixed x (W), then y (P), then z (R)
-        rotations = Rotation.from_euler("xyz", values, degrees=True)
-    elif kind == ROTATION_VECTOR:
-        rotations = Rotation.from_rotvec(values)
-    else:
-        length = np.linalg.norm(values, axis=1)
-        bad = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
-        if len(bad):
-            index = int(bad[0])
-            table.fail(f"the quaternion has length {length[index]:.6g}, not 1", index, "qw")
-        rotations = Rotation.from_quat(values)
-    return np.asarray(rotations.as_matrix())
+    if kind == ROTATION_VECTOR:
+        return frames.exp_rotation(values)
+    if kind in (EULER, FANUC):
+        turns = np.radians(values)[:, :, None] * np.eye(3)
+        Rx, Ry, Rz = np.moveaxis(frames.exp_rotation(turns), 1, 0)
+        # about x, then the new y, then the new z; of FANUC about the fixed x (W), y (P), z (R)
+        return np.asarray(Rx @ Ry @ Rz if kind == EULER else Rz @ Ry @ Rx)
+    length = np.linalg.norm(values, axis=1)
+    bad = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    if len(bad):
+        index = int(bad[0])
+        table.fail(f"the quaternion has length {length[index]:.6g}, not 1", index, "qw")
+    return frames.transform_from_quat(np.zeros(3), values)[:, :3, :3]
 
 
 def read_stamps(table: Cells) -> NDArray[np.int64]:

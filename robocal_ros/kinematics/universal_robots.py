@@ -11,10 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, exp_rotation
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics.arm import ALPHA, NEARLY_PARALLEL, THETA, A, D, SerialArm
 from robocal_ros.kinematics.tables import read_published
@@ -78,7 +77,7 @@ def read_panel_poses(path: Path) -> Measurements:
     return Measurements(
         q=np.radians(values[:, :6]),
         position=values[:, 6:9] * 1e-3,
-        rotation=Rotation.from_rotvec(values[:, 9:]).as_matrix(),
+        rotation=exp_rotation(values[:, 9:]),
         target=("flange",) * len(values),
         sample=tuple(map(str, table.rows)),
     )

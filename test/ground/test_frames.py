@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground import frames
 
@@ -31,6 +32,21 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
     T = frames.transform_from_quat([1.0, 2.0, 3.0], [0.0, 0.0, s, s])
     np.testing.assert_allclose(T, frames.transform(R, [1.0, 2.0, 3.0]), atol=1e-15)
     np.testing.assert_allclose(T @ [1.0, 0.0, 0.0, 1.0], [1.0, 3.0, 3.0, 1.0], atol=1e-15)
+
+
+def test_turns_are_as_scipy_has_them():
+    """Small and large, and half turns, whose vector points the same way."""
+    rng = np.random.default_rng(11)
+    w = rng.normal(size=(400, 3))
+    length = np.concatenate([10.0 ** rng.uniform(-12.0, 0.0, 200), rng.uniform(0.0, np.pi, 200)])
+    w *= (length / np.linalg.norm(w, axis=1))[:, None]
+    w = np.vstack([w, np.zeros(3), np.pi * np.eye(3), 5.0 * w[-9:]])
+    R = Rotation.from_rotvec(w).as_matrix()
+    np.testing.assert_allclose(frames.exp_rotation(w), R, rtol=0.0, atol=4e-15)
+    expected = Rotation.from_matrix(R).as_rotvec()
+    np.testing.assert_allclose(frames.log_rotation(R), expected, rtol=1e-13, atol=4e-15)
+    assert frames.log_rotation(R[:0]).shape == (0, 3)
+    assert frames.exp_rotation(w.reshape(-1, 1, 3)).shape == (len(w), 1, 3, 3)
 
 
 @given(seeds, angles)

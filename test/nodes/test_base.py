@@ -336,3 +336,17 @@ def test_what_every_node_imports_brings_no_session_and_no_kernels(module: str) -
     )
     heavy = {"numba", "scipy", "robocal_ros.thermal.session", "robocal_ros.thermal.tracking"}
     assert heavy.isdisjoint(told.stdout.split())
+
+
+def test_a_robot_and_its_tables_are_read_without_scipys_rotations() -> None:
+    """Finding: each node with a robot imported scipy.spatial, which takes a tenth of a second."""
+    program = (
+        "import sys, robocal_ros.ros.robot, robocal_ros.tool.files, numpy as np\n"
+        "from robocal_ros.ground import frames\n"
+        "frames.log_rotation(frames.rotation_from_rpy([0.1, 0.2, 0.3]))\n"
+        "print(*sys.modules)"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, check=True, text=True
+    )
+    assert "scipy.spatial" not in told.stdout.split()
