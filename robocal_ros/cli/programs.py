@@ -26,7 +26,7 @@ from robocal_ros.cli.main import (
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, WrongRobotError
-from robocal_ros.ground.files import read_bytes, read_text, write_bytes
+from robocal_ros.ground.files import read_bytes, read_text, shortened, write_bytes
 from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
@@ -38,6 +38,7 @@ from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
 from robocal_ros.programs.conventions import COUNT, base_text, tool_text
 from robocal_ros.programs.correcting import (
     STATES,
+    CorrectedProgram,
     CorrectionModels,
     ProgramCorrection,
     dialect_of,
@@ -309,18 +310,11 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
     )
     done = correction.correct(program)
-    told = report(done)
-    left = told["count"]["not_corrected"]
-    verdict = Verdict(Code.ACCEPT, f"all of {len(done.points)} points are as they should be")
-    if not done.points:
-        raise InputError("holds no point that is known here", file=str(args.program))
-    if left:
-        words = f"{left} of {len(done.points)} points are left as they were"
-        hint = "" if args.partial else "; --partial writes the others all the same"
-        verdict = Verdict(Code.LIMIT_EXCEEDED, words + hint)
-    written = args.output is not None and (args.partial or not left)
+    verdict = _program_verdict(done, args)
+    written = args.output is not None and (args.partial or verdict.accept)
     if written:
         write_bytes(args.output, done.text.encode("latin-1"))
+    told = report(done)
     document: CorrectedProgramDocument = {
         "program": str(args.program),
         "maker": dialect.maker,
@@ -332,6 +326,25 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         "verdict": verdict_document(verdict),
     }
     return CliResult(document, _show_corrected)
+
+
+def _program_verdict(done: CorrectedProgram, args: argparse.Namespace) -> Verdict:
+    """Whether all points of this robot are right. Raises `InputError` where there are none."""
+    own = [one for one in done.points if not one.point.of_another]
+    others = [one.point.name for one in done.points if one.point.of_another]
+    if not done.points:
+        raise InputError("holds no point that is known here", file=str(args.program))
+    if not own:
+        words = f"holds no point of this robot: {others[0]} {done.points[0].reason}"
+        raise InputError(words, file=str(args.program))
+    names = shortened(", ".join(others))
+    told = f"; of another group alone, not corrected: {names}" if others else ""
+    left = sum(1 for one in own if one.reason)
+    if not left:
+        return Verdict(Code.ACCEPT, f"all of {len(own)} points are as they should be{told}")
+    hint = "" if args.partial else "; --partial writes the others all the same"
+    words = f"{left} of {len(own)} points are left as they were{told}{hint}"
+    return Verdict(Code.LIMIT_EXCEEDED, words)
 
 
 def _given_frames(args: argparse.Namespace, dialect: Dialect, program: str) -> dict[str, Array]:

@@ -12,6 +12,7 @@ Group 1 is corrected; positions of others stay, and are told. Sources are in doc
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,14 +79,15 @@ class FanucDialect(Dialect):
             own = next((group for group in groups if group[1] == "1"), None)
             name = f"P[{found[1]}]" + (f" {found[2]}" if found[2] else "")
             line = line_of(text, found.start())
-            for other in {group[1] for group in groups} - {"1"}:
+            numbers = sorted({group[1] for group in groups} - {"1"}, key=int)
+            for other in numbers:
                 others.setdefault(other, []).append(line)
             if own is None:
-                point = ProgramPoint(name, line, (), problem="has no position of group 1")
+                point = _of_others(name, line, numbers)
             else:
                 behind = [group.start() for group in groups if group.start() > own.start()]
                 point = _point(text, name, line, own.end(), min([*behind, end]))
-            if int(found[1]) in relative:
+            if own is not None and int(found[1]) in relative:
                 point = replace(point, problem="is relative to the point before (INC)")
             points.append(replace(point, order=len(points)))
         frames = {"UF0": np.eye(4), "UT0": np.eye(4)}
@@ -96,7 +98,7 @@ class FanucDialect(Dialect):
         notes = [
             f"group {number}: its positions stay as they are, the first of {len(lines)} in line "
             f"{lines[0]}; group 1 alone is corrected"
-            for number, lines in sorted(others.items())
+            for number, lines in sorted(others.items(), key=lambda item: int(item[0]))
         ]
         if led := _LED.search(text, 0, start):
             notes.append(
@@ -136,6 +138,14 @@ class FanucDialect(Dialect):
                 parts[place] = str(round(stance.q[joint] / (2.0 * HALF_TURN)))
         text = "".join(parts)
         return {} if text == old else {"CONFIG": text}
+
+
+def _of_others(name: str, line: int, groups: Sequence[str]) -> ProgramPoint:
+    """A point without a position of group 1; ``groups``: those that it has one of."""
+    if not groups:
+        return ProgramPoint(name, line, (), problem="has no position")
+    words = f"is of group {' and '.join(groups)} alone: group 1 alone is corrected"
+    return ProgramPoint(name, line, (), problem=words, of_another=True)
 
 
 def _point(text: str, name: str, line: int, start: int, end: int) -> ProgramPoint:

@@ -82,6 +82,7 @@ class ProgramPoint:
     ``marks``: what says the posture, by the names that its dialect has for them.
     ``external``: of a pose the axes beside the robot's own that it says, by number from 1.
     ``problem``: why it cannot be corrected, whatever the model; empty: it can.
+    ``of_another``: it moves other axes than this robot's, so that nothing of it is to be corrected.
     """
 
     name: str
@@ -95,6 +96,7 @@ class ProgramPoint:
     marks: Mapping[str, Field] = field(default_factory=dict)
     external: Mapping[int, Field] = field(default_factory=dict)
     problem: str = ""
+    of_another: bool = False
     order: int = 0  # in which the program comes to it, as far as its text tells
 
     @property

@@ -100,6 +100,27 @@ def test_a_tool_that_is_reckoned_is_not_that_of_the_same_line_elsewhere(folder: 
     assert "unknown tool $TOOL of line 2" in point["reason"]
 
 
+def test_points_of_another_group_are_told_by_name_and_hold_nothing_up(folder: Path, capsys):
+    """As of a positioner that turns alone: no model of this robot says where it should be."""
+    joints = ",\n".join(
+        f"\tJ{i} = {x:.3f} deg" for i, x in enumerate(np.degrees(postures(1, 6)[0]), start=1)
+    )
+    own = f"P[1]{{\n   GP1:\n\tUF : 0, UT : 0,\n{joints}\n}};\n"
+    others = 'P[2:"turn"]{\n   GP2:\n\tUF : 0, UT : 1,\n\tJ1 = 90.000 deg\n};\n'
+    (folder / "part.ls").write_text(f"/PROG  PART\n/MN\n/POS\n{own}{others}/END\n")
+    _, document = command(capsys, "part.ls", *MODEL, "--output", "new.ls")
+    assert document["verdict"]["code"] == "ACCEPT"
+    assert document["verdict"]["reason"] == (
+        "all of 1 points are as they should be; of another group alone, not corrected: P[2] turn"
+    )
+    assert document["points"][1]["reason"] == "is of group 2 alone: group 1 alone is corrected"
+    assert others in (folder / "new.ls").read_text()
+    (folder / "turn.ls").write_text(f"/PROG  TURN\n/MN\n/POS\n{others}/END\n")
+    status, document = command(capsys, "turn.ls", *MODEL)
+    assert status == 2
+    assert "no point of this robot: P[2] turn is of group 2 alone" in document["error"]["message"]
+
+
 def test_joint_targets_of_kawasaki_are_corrected(folder: Path, capsys):
     rows = "\n".join(
         f"#p{i} " + " ".join(f"{x:.4f}" for x in np.degrees(q))

@@ -521,7 +521,7 @@ def test_a_fanuc_position_of_another_group_is_told_and_no_position_of_the_robot(
     assert one.numbers[0] == 1731.5
     assert two.numbers[0] == 10.0
     assert (three.name, three.fields, three.problem) == (
-        "P[3] gap", (), "has no position of group 1",
+        "P[3] gap", (), "is of group 2 alone: group 1 alone is corrected",
     )  # fmt: skip
     told = [note.partition(":")[0] + note.partition(",")[2] for note in found.notes]
     assert told == [
