@@ -46,6 +46,7 @@ from robocal_ros.programs.correcting import (
 )
 from robocal_ros.programs.fanuc import FanucDialect
 from robocal_ros.programs.frame_shift import LEVER_M, PARTS, FrameShift, best_shift, given_shift
+from robocal_ros.programs.krl import KrlDialect
 from robocal_ros.programs.points import OF_LINE, Dialect, frame_given
 from robocal_ros.thermal.proposing import (
     ShiftedWork,
@@ -234,22 +235,7 @@ def add_correct_program(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write it also where points are left as they are",
     )
-    parser.add_argument(
-        "--frames",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="KUKA, ABB: further file of tools and bases ($config.dat, a module)",
-    )
-    parser.add_argument(
-        "--frame",
-        action="append",
-        default=[],
-        metavar="NAME=X,Y,Z,…",
-        help="a tool or base by the program's name for it (TOOL_DATA[1], tGun, UT4, UF2, tcp), in "
-        "the maker's own numbers and units",
-    )
+    _add_other_files(parser)
     for name, what in (("tool", "tool"), ("base", "base, user frame or work object")):
         parser.add_argument(
             f"--{name}", metavar="NAME", help=f"{what} of points whose program says none"
@@ -279,6 +265,32 @@ def add_correct_program(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_other_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--module",
+        type=Path,
+        metavar="FILE",
+        help="KUKA: the other file of the module, read with the program (.src of a .dat, .dat of a "
+        ".src); without it the one beside the program that has its name",
+    )
+    parser.add_argument(
+        "--frames",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="KUKA, ABB: further file of tools and bases ($config.dat, a module)",
+    )
+    parser.add_argument(
+        "--frame",
+        action="append",
+        default=[],
+        metavar="NAME=X,Y,Z,…",
+        help="a tool or base by the program's name for it (TOOL_DATA[1], tGun, UT4, UF2, tcp), in "
+        "the maker's own numbers and units",
+    )
+
+
 def _add_bounds(parser: argparse.ArgumentParser) -> None:
     for name, default, what in (("mm", 5.0, "of the flange"), ("deg", 1.0, "of a joint")):
         parser.add_argument(
@@ -305,6 +317,14 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
     if args.posture_deg is not None and len(args.posture_deg) != models.nominal.n:
         raise InputError(f"--posture-deg: {models.nominal.name} has {models.nominal.n} joints")
     program = _program_text(args.program, dialect)
+    module = None
+    if isinstance(dialect, KrlDialect):
+        module = args.module or other_file(args.program)
+        warnings += _module_note(args.program, module)
+        if module is not None:
+            dialect = KrlDialect(_program_text(module, dialect), module.name)
+    elif args.module is not None:
+        raise InputError(f"--module: a program of {dialect.maker} is one file; leave it out")
     given = _given_frames(args, dialect, program)
     correction = ProgramCorrection(
         dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
@@ -317,6 +337,7 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
     told = report(done)
     document: CorrectedProgramDocument = {
         "program": str(args.program),
+        "module": None if module is None else str(module),
         "maker": dialect.maker,
         "robot": models.nominal.name,
         "model_hash": models.nominal.model_hash,
@@ -347,6 +368,31 @@ def _program_verdict(done: CorrectedProgram, args: argparse.Namespace) -> Verdic
     return Verdict(Code.LIMIT_EXCEEDED, words)
 
 
+def other_file(program: Path) -> Path | None:
+    """The file beside a KUKA program that makes a module with it; upper and lower case alike."""
+    wanted = (".src", ".sub") if program.suffix.lower() == ".dat" else (".dat",)
+    try:
+        beside = {
+            path.suffix.lower(): path
+            for path in sorted(program.parent.iterdir())
+            if path.stem.lower() == program.stem.lower() and path.is_file()
+        }
+    except OSError:  # a folder that may not be listed
+        return None
+    return next((beside[suffix] for suffix in wanted if suffix in beside), None)
+
+
+def _module_note(program: Path, module: Path | None) -> list[str]:
+    """What is not known of a data list that is read alone."""
+    if module is not None or program.suffix.lower() != ".dat":
+        return []
+    return [
+        f"{program.name} is read without {program.stem}.src, which is not beside it: a point that "
+        "its motions take as a way (LIN_REL), or reckon with, is corrected as a place; give it by "
+        "--module"
+    ]
+
+
 def _given_frames(args: argparse.Namespace, dialect: Dialect, program: str) -> dict[str, Array]:
     """Tools and bases that ``--frame`` names, beside them those of the program and ``--frames``.
 
@@ -359,7 +405,7 @@ def _given_frames(args: argparse.Namespace, dialect: Dialect, program: str) -> d
     asked = {name.lower() for name in ends if name} - {name.lower() for name in named}
     known = dict(read.frames) if args.frames else {}
     for path in args.frames:
-        for name, T in _frames_of(path, dialect).items():
+        for name, T in _frames_of(path, dialect_of(args.program.suffix)).items():
             off_m, off_rad = frames.apart(known.setdefault(name, T), T)
             if name.lower() in asked and (off_m > SAME_M or off_rad > SAME_RAD):
                 words = f"{name} is another one than in the program, or in the file before"
@@ -395,6 +441,8 @@ def _show_corrected(console: "Console", document: Document) -> None:
     count = document["count"]
     title = ", ".join(f"{count[state]} {state.replace('_', ' ')}" for state in STATES)
     head = ("point", "line", "moved mm", "deg", "left mm", "why not")
+    if document["module"] is not None:
+        print_words(console, f"Read with {document['module']}.")
     print_table(console, f"{document['program']}: {title}", head, rows, words=(0, 5))
     for place in document["computed"]:
         print_words(

@@ -63,6 +63,9 @@ class ProgramReportDocument(TypedDict):
 @printed("correct-program")
 class CorrectedProgramDocument(RobotDocument, ProgramReportDocument):
     program: str
+    module: Annotated[
+        str | None, "KUKA: the module's other file, read with it; null where none was."
+    ]
     maker: Maker
     output: Annotated[str | None, "The program that was written; null where none was."]
     verdict: VerdictDocument

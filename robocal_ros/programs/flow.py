@@ -8,13 +8,13 @@ sets in some way: unknown behind its call, but for what is in force there anyway
 
 import re
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from robocal_ros.ground.frames import Array
-from robocal_ros.programs.points import OF_LINE, line_of
+from robocal_ros.programs.points import OF_LINE
 
 State = Mapping[str, str | None]  # by kind the frame in force; None, or left out: nothing says it
 
@@ -98,10 +98,18 @@ class _Known:
 
 
 class Flow:
-    """What is in force where; ``frames``: by which two names may mean the same."""
+    """What is in force where; ``frames``: by which two names may mean the same.
 
-    def __init__(self, text: str, steps: Sequence[FlowStep], frames: Mapping[str, Array]) -> None:
-        self._text, self._frames = text, frames
+    ``line``: of a place in the text, in words.
+    """
+
+    def __init__(
+        self,
+        line: Callable[[int], object],
+        steps: Sequence[FlowStep],
+        frames: Mapping[str, Array],
+    ) -> None:
+        self._line, self._frames = line, frames
         self._steps = sorted(steps, key=lambda step: step.at)
         self._places = [step.at for step in self._steps]
         self._states: list[State] = []
@@ -133,7 +141,7 @@ class Flow:
                 case "call":
                     sets = known.sets.get(step.name, set())
                     found.sets.setdefault(routine, set()).update(sets)
-                    kinds = {kind for kind, its in sets if not self._same(its, state.get(kind))}
+                    kinds = {kind for kind, its in sets if not self.same(its, state.get(kind))}
                     others = found.called.get(step.name, state)
                     met = self._met([others, state], self._defined[step.name])
                     found.called[step.name] = met
@@ -181,16 +189,17 @@ class Flow:
         kinds = dict.fromkeys(kind for state in states for kind in state)
         return {
             kind: first.get(kind)
-            if all(self._same(first.get(kind), other.get(kind)) for other in others)
+            if all(self.same(first.get(kind), other.get(kind)) for other in others)
             else self._unknown(kind, at)
             for kind in kinds
         }
 
-    def _same(self, one: str | None, other: str | None) -> bool:
+    def same(self, one: str | None, other: str | None) -> bool:
+        """Whether two names mean the same frame."""
         if one == other or not (one or other):
             return True
         T_one, T_other = (self._frames.get(name or "") for name in (one, other))
         return T_one is not None and T_other is not None and np.array_equal(T_one, T_other)
 
     def _unknown(self, kind: str, at: int) -> str:
-        return f"{kind}{OF_LINE}{line_of(self._text, at)} on"
+        return f"{kind}{OF_LINE}{self._line(at)} on"

@@ -22,6 +22,7 @@ docs/programs.md.
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -125,7 +126,7 @@ class KawasakiDialect(Dialect):
         steps = labels + flow_steps(clean, _BLOCK, _CALL)
         for span in programs:
             steps += _set_up(text, clean, span, constants, frames)
-        flow = Flow(text, steps, frames)
+        flow = Flow(partial(line_of, text), steps, frames)
         for span in programs:
             computed += _used(clean, span, flow, uses, arrays)
             points += _steps(text, clean, *span)

@@ -4,12 +4,16 @@
     DECL E6POS XP1={X 1250.5,Y -20.0,Z 980.25,A 90.0,B 0.0,C 180.0,S 2,T 35,E1 0.0,…}
     DECL FDAT FP1={TOOL_NO 1,BASE_NO 2,IPO_FRAME #BASE,…}
 
-Of a point of an inline form (XP1) the frames are in FP1; elsewhere those that were set last above
-in its routine, by FDAT_ACT too, or by the WITH of its motion or spline block.
+Of a point of an inline form (XP1) the frames are in FP1; elsewhere they are those of the motions to
+it: set last above in their routine, by FDAT_ACT too, or by the WITH of a motion or spline block.
+The .dat and the .src of one name are a module: what one declares the other one moves to.
 Sources are in docs/programs.md.
 """
 
+import math
 import re
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -38,6 +42,7 @@ POSE = ("X", "Y", "Z", "A", "B", "C")
 AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
 EXTERNAL = ("E1", "E2", "E3", "E4", "E5", "E6")
 ROBROOT = ("$NULLFRAME", "$WORLD", "$ROBROOT")
+KINDS = ("$TOOL", "$BASE", "$IPO_MODE")
 TARGETS = ("E6POS", "POS", "E6AXIS", "AXIS")
 BEHIND, ABOVE, FLIPPED = 1, 2, 4  # bits of S; the third says again what T says of A5
 ABSOLUTE = 16
@@ -57,6 +62,7 @@ _ASSIGNED = re.compile(
 _MOVED = re.compile(
     rf"\b(?P<move>{MOVES}(?P<relative>_REL)?)\b[^\r\n{{}}]*(?:\{{[^{{}}]*\}}\s*,\s*)?$", re.I
 )
+_LITERAL = re.compile(r"(\$?[A-Za-z_]\w*(?:\[[^\]\r\n]*\])?)\s*=\s*\{")
 _NAME = r"(\w+(?:\[\w+\])?)"
 _USED = re.compile(rf"\b{MOVES}(?:\s+{_NAME}|\s*\{{[^{{}}]*\}})(?:\s*,\s*{_NAME})?", re.I)
 _INDEXED = r"(\w+(?:\[\d+\])?)(?:\[[^\]\r\n]*\])?"
@@ -64,7 +70,7 @@ _RELATIVE = re.compile(
     rf"\b{MOVES}_REL(?:\s+{_INDEXED}|\s*\{{[^{{}}]*\}})(?:\s*,\s*{_INDEXED})?", re.I
 )
 _DECLARED = re.compile(
-    r"\b(?:E6POS|POS|E6AXIS|AXIS)\s+((?:\w+(?:\[[^\]\r\n]*\])?[ \t]*,?[ \t]*)+)", re.I
+    r"\b(E6POS|POS|E6AXIS|AXIS|FRAME)\s+((?:\w+(?:\[[^\]\r\n]*\])?[ \t]*,?[ \t]*)+)", re.I
 )
 _FDAT = re.compile(r"\bFDAT\s+(\w+)\s*=\s*\{([^{}]*)\}", re.I)
 _FRAME_DATA = re.compile(
@@ -75,9 +81,11 @@ _SET = re.compile(
     r"(?P<value>(?:\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?)[^\r\n;]*)"
     r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)"
     r"|^[ \t]*FDAT_ACT(?:\.\w+)?\s*=(?!=)\s*(?P<fdat>\{[^{}]*\}|[^\r\n]*)"
-    r"|\$IPO_MODE\s*=(?!=)\s*(?P<mode>#?\w+)",
+    r"|\$IPO_MODE\s*=(?!=)\s*(?P<mode>#?\w+(?:\(\s*\w+\.\w+\s*\))?)",
     re.I | re.M,
 )
+# As inline forms of KSS 8 write it: what the FDAT of a point says.
+_INLINE = re.compile(r"S(?:TOOL2?|BASE|IPO_MODE)\(\s*(\w+)(?:\.\w+)?\s*\)", re.I)
 _BLOCK = re.compile(
     r"^[ \t]*(?:(?P<begin>IF|SWITCH)|(?P<loop>WHILE|FOR|LOOP|REPEAT)|(?P<branch>CASE|DEFAULT)"
     r"|(?P<else>ELSE)|(?P<leave>EXIT)|(?P<end>UNTIL|END(?:IF|SWITCH|WHILE|FOR|LOOP|FCT)?)"
@@ -111,53 +119,79 @@ _CHANGED = re.compile(
 )
 
 
+@dataclass(frozen=True)
 class KrlDialect(Dialect):
-    """KUKA: nine digits as the controller writes them; S and T follow the joints."""
+    """KUKA: nine digits as the controller writes them; S and T follow the joints.
 
-    maker, suffixes = "kuka", (".src", ".dat", ".sub")
+    ``other``: text of the module's other file, the .src of a .dat or the .dat of a .src, which is
+    read with each text; ``other_name``: the file's. Without it empty.
+    """
+
+    other: str = ""
+    other_name: str = ""
+    maker = "kuka"
+    suffixes = (".src", ".dat", ".sub")
     decimals = Decimals(length=4, turn=6, joint=6)
     names_frames = True
 
     def read(self, text: str) -> Program:
         """Points of POS and E6POS, of AXIS and E6AXIS, and of motions; frames by number."""
-        clean = masked(text, ";")
+        clean = masked(f"{text}\n{self.other}", ";")
+        line = self._lines(text)
         frames = {"TOOL_DATA[0]": np.eye(4), "BASE_DATA[0]": np.eye(4)}
         frames |= {name: np.eye(4) for name in ROBROOT}
-        numbered, unsettled = _numbered_frames(text, clean)
+        numbered, unsettled = _numbered_frames(line, clean)
         frames |= numbered
         inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
-        flow, within = _flow(text, clean, frames, inline), _withs(text, clean, frames, inline)
-        used = {name.upper() for found in _USED.finditer(clean) for name in found.groups() if name}
-        used |= {name.partition("[")[0] for name in used if not _NUMBERED.search(name)}
-        for found in _DECLARED.finditer(clean):  # an array's points are assigned one by one
-            used |= set(re.findall(r"\w+", re.sub(r"\[[^\]]*\]", "", found[1].upper())))
-        reckoned: dict[str, int] = {}
-        for found in chain(_OPERAND.finditer(clean), _RELATIVE.finditer(clean)):
-            for name in filter(None, found.groups()):
-                reckoned.setdefault(name.upper(), line_of(text, found.start()))
+        flow, within = _flow(line, clean, frames, inline), _withs(line, clean, frames, inline)
+        variables = _Variables(clean, len(text))
         points: list[ProgramPoint] = []
-        for braces in _BRACES.finditer(clean):
-            point = _point(text, clean, braces, used)
-            if point is None:
+        for braces in _BRACES.finditer(clean, 0, len(text)):
+            found = _point(text, clean, braces, variables)
+            if found is None:
                 continue
-            point = _framed(point, braces.start(), inline, flow, within)
+            point, name, at = *found, braces.start()
+            goals = variables.motions(name, at) if name else [at]
             if not point.joints:
+                point = _framed(point, goals, inline, flow, within)
                 tool = unsettled.get(point.tool or "", point.tool)
                 frame = unsettled.get(point.frame or "", point.frame)
                 point = replace(point, tool=tool, frame=frame)
-            name = point.name.upper()
-            if line := reckoned.get(name, reckoned.get(name.partition("[")[0])):
-                problem = f"the program reckons with it in line {line}"
+            if name and (place := variables.reckoned_at(name, at)) is not None:
+                problem = f"the program reckons with it in line {line(place)}"
                 point = replace(point, problem=point.problem or problem)
-            points.append(replace(point, order=len(points)))
+            points.append(replace(point, order=min(goals, default=at)))
+        made = [*_COMPUTED.finditer(_without(clean)), *_CHANGED.finditer(clean)]
         computed = tuple(
             (line_of(text, found.start()), text[found.start() : found.end()].strip())
-            for found in chain(_COMPUTED.finditer(_without(clean)), _CHANGED.finditer(clean))
+            for found in made
+            if found.start() < len(text)
         )
+        elsewhere = [found.start() for found in made if found.start() > len(text)]
+        return Program(text, tuple(points), frames, computed, self._notes(points, elsewhere, line))
+
+    def _lines(self, text: str) -> Callable[[int], str]:
+        """Of a place in both files, the line in words."""
+
+        def line(at: int) -> str:
+            if at <= len(text):
+                return str(line_of(text, at))
+            return f"{line_of(self.other, at - len(text) - 1)} of {self.other_name}"
+
+        return line
+
+    def _notes(
+        self, points: Sequence[ProgramPoint], elsewhere: Sequence[int], line: Callable[[int], str]
+    ) -> tuple[str, ...]:
+        """``elsewhere``: where the other file makes a point or a frame itself."""
         status = [bits_of(point.marks["S"]) for point in points if "S" in point.marks]
         exact = sum(1 for one in status if one is not None and one & ABSOLUTE)
         notes = [f"{exact} points were {_ABSOLUTE}"] if exact else []
-        return Program(text, tuple(points), frames, computed, tuple(notes))
+        if elsewhere:
+            more = len(elsewhere) - 1
+            words = f", and in {more} other places there" if more else ""
+            notes.append(f"line {line(min(elsewhere))} makes points or frames itself{words}: look")
+        return tuple(notes)
 
     def marks(self, point: ProgramPoint, stance: Stance) -> dict[str, str]:
         """S and T, of which only bits that have changed are written."""
@@ -181,6 +215,71 @@ class KrlDialect(Dialect):
         return found
 
 
+_Variable = tuple[int, str]  # the routine that declares it, 0: the module; its name
+
+
+class _Variables:
+    """What a module's position variables are for, each where it is named.
+
+    A name means what its routine declares, else what the module does. ``boundary``: where the
+    second of two files begins.
+    """
+
+    def __init__(self, clean: str, boundary: int) -> None:
+        routines = {found.start() for found in _BLOCK.finditer(clean) if found["alone"]}
+        self._begins = sorted({boundary, *routines})
+        self._local: set[_Variable] = set()
+        self._goals: dict[_Variable, list[int]] = {}  # by which motions go to it
+        self._set: dict[_Variable, list[int]] = {}
+        self._reckoned: dict[_Variable, int] = {}
+        declared: list[tuple[str, str, int]] = []
+        for found in _DECLARED.finditer(clean):
+            names = re.findall(r"\w+", re.sub(r"\[[^\]]*\]", "", found[2]))
+            declared += [(found[1].upper(), name, found.start()) for name in names]
+        for _, name, at in declared:
+            scope = bisect_right(self._begins, at)
+            if scope and self._begins[scope - 1] in routines:
+                self._local.add((scope, name.upper()))
+        self._positions = {self._meant(name, at) for kind, name, at in declared if kind in TARGETS}
+        for found in _LITERAL.finditer(clean):
+            self._set.setdefault(self._meant(found[1], found.start(1)), []).append(found.end() - 1)
+        for found in _USED.finditer(clean):
+            for name in filter(None, found.groups()):
+                whole = name if _NUMBERED.search(name) else _array(name)
+                goals = self._goals.setdefault(self._meant(whole, found.start()), [])
+                goals.append(found.start())
+        # Of A:B frame B is given in A; what a relative motion names is a way.
+        for found in chain(_OPERAND.finditer(clean), _RELATIVE.finditer(clean)):
+            for name in filter(None, found.groups()):
+                self._reckoned.setdefault(self._meant(name, found.start()), found.start())
+
+    def _meant(self, name: str, at: int) -> _Variable:
+        scope = bisect_right(self._begins, at)
+        return (scope if (scope, _array(name).upper()) in self._local else 0, name.upper())
+
+    def is_position(self, name: str, at: int) -> bool:
+        """Whether it was declared as a position, or a motion goes to it."""
+        both = self._meant(name, at), self._meant(_array(name), at)
+        return any(one in self._positions or one in self._goals for one in both)
+
+    def motions(self, name: str, at: int) -> list[int]:
+        """Where motions go to the value that is set at a place: up to the next one, else all."""
+        one, array = self._meant(name, at), self._meant(_array(name), at)
+        goals = [place for key in dict.fromkeys((one, array)) for place in self._goals.get(key, ())]
+        until = min((place for place in self._set.get(one, ()) if place > at), default=math.inf)
+        return [place for place in goals if at < place < until] or goals
+
+    def reckoned_at(self, name: str, at: int) -> int | None:
+        """Where the program reckons with it; None: it does not."""
+        found = self._reckoned.get(self._meant(_array(name), at))
+        return self._reckoned.get(self._meant(name, at), found)
+
+
+def _array(name: str) -> str:
+    """An element's array; a variable itself."""
+    return name.partition("[")[0]
+
+
 def _parts(body: str, at: int) -> dict[str, Field]:
     """Components of an aggregate that begins at ``at``: X, Y … by name."""
     found = {}
@@ -200,7 +299,9 @@ def _frame(body: str) -> Array | None:
     return pose_of("kuka", [part.value for part in fields])
 
 
-def _numbered_frames(text: str, clean: str) -> tuple[dict[str, Array], dict[str, str]]:
+def _numbered_frames(
+    line: Callable[[int], str], clean: str
+) -> tuple[dict[str, Array], dict[str, str]]:
     """TOOL_DATA and BASE_DATA that the text gives; those of which it does not give one value.
 
     These have the line where that shows in their names, as what is unknown at run time.
@@ -210,12 +311,17 @@ def _numbered_frames(text: str, clean: str) -> tuple[dict[str, Array], dict[str,
     for found in _FRAME_DATA.finditer(clean):
         name, T = f"{found[1].upper()}[{found[2]}]", _frame(found[3] or "")
         if T is None or not np.array_equal(known.setdefault(name, T), T):
-            unsettled.setdefault(name, f"{name}{OF_LINE}{line_of(text, found.start())}")
+            unsettled.setdefault(name, f"{name}{OF_LINE}{line(found.start())}")
     return {name: T for name, T in known.items() if name not in unsettled}, unsettled
 
 
-def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> ProgramPoint | None:
-    """The point in braces; None where something else is in them."""
+def _point(
+    text: str, clean: str, braces: re.Match[str], variables: _Variables
+) -> tuple[ProgramPoint, str] | None:
+    """The point in braces, and the variable that it is set to, empty for a motion's.
+
+    None where something else is in them.
+    """
     parts = _parts(braces[1], braces.start() + 1)
     joints = "A1" in parts and "X" not in parts
     names = AXES if joints else POSE
@@ -225,32 +331,31 @@ def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> Prog
     assigned, moved = _ASSIGNED.search(before), _MOVED.search(before)
     line = line_of(text, braces.start())
     if assigned:
-        name = assigned["name"].upper()
+        title = name = assigned["name"]
         target = (assigned["type"] or "").upper() in TARGETS
-        target = target or name in used or name.partition("[")[0] in used
-        if not target or name.startswith(("$", "TOOL_DATA", "BASE_DATA")):
+        target = target or variables.is_position(name, braces.start())
+        if not target or name.upper().startswith(("$", "TOOL_DATA", "BASE_DATA")):
             return None
-        title = assigned["name"]
     elif moved:
-        title = f"{moved['move']} in line {line}"
+        title, name = f"{moved['move']} in line {line}", ""
     else:
         return None
-    if not any(name in parts for name in names):
+    if not any(each in parts for each in names):
         return None
-    fields = tuple(parts[name] for name in names if name in parts)
+    fields = tuple(parts[each] for each in names if each in parts)
     problem = require_numbers(fields)
     if moved and moved["relative"]:
         problem = "is relative to the point before"
     elif len(fields) < len(names):
         problem = "leaves components as they are at run time: " + ", ".join(
-            name for name in names if name not in parts
+            each for each in names if each not in parts
         )
-    external = {i: parts[name] for i, name in enumerate(EXTERNAL, start=1) if name in parts}
-    marks: dict[str, Field] = {name: parts[name] for name in ("S", "T") if name in parts}
+    external = {i: parts[each] for i, each in enumerate(EXTERNAL, start=1) if each in parts}
+    marks: dict[str, Field] = {each: parts[each] for each in ("S", "T") if each in parts}
     point = ProgramPoint(title, line, fields, joints, DEGREE, marks=marks, problem=problem)
     if joints or problem:
-        return replace(point, marks={})
-    return replace(point, posture=_posture(parts), external=external)
+        return replace(point, marks={}), name
+    return replace(point, posture=_posture(parts), external=external), name
 
 
 def bits_of(mark: Field) -> int | None:
@@ -290,17 +395,21 @@ def _without(clean: str) -> str:
     return _WITH.sub(lambda found: found["motion"].ljust(len(found[0])), clean)
 
 
-def _flow(text: str, clean: str, frames: dict[str, Array], inline: dict[str, str]) -> Flow:
+def _flow(
+    line: Callable[[int], str], clean: str, frames: dict[str, Array], inline: dict[str, str]
+) -> Flow:
     """What is set but by a WITH."""
     labels, clean = labels_of(_without(clean), _LABEL)
     steps = labels + flow_steps(clean, _BLOCK, _CALL)
     for found in _SET.finditer(clean):
-        names = _given(line_of(text, found.start()), found, frames, inline)
+        names = _given(line(found.start()), found, frames, inline)
         steps.append(FlowStep(found.start(), "set", names))
-    return Flow(text, steps, frames)
+    return Flow(line, steps, frames)
 
 
-def _withs(text: str, clean: str, frames: dict[str, Array], inline: dict[str, str]) -> list[_With]:
+def _withs(
+    line: Callable[[int], str], clean: str, frames: dict[str, Array], inline: dict[str, str]
+) -> list[_With]:
     """In the order of the text: an inner one goes before the one around it."""
     sets = []
     for found in _WITH.finditer(clean):
@@ -308,24 +417,25 @@ def _withs(text: str, clean: str, frames: dict[str, Array], inline: dict[str, st
         until = end.start() if end else found.end()
         for part in arguments(clean, found.end("motion"), found.end()):
             if given := _SET.match(part.text):
-                names = _given(line_of(text, part.start), given, frames, inline)
+                names = _given(line(part.start), given, frames, inline)
                 if None not in names.values():
                     sets.append(_With(found.start(), names, until))
     return sets
 
 
 def _given(
-    line: int, found: re.Match[str], frames: dict[str, Array], inline: dict[str, str]
+    line: str, found: re.Match[str], frames: dict[str, Array], inline: dict[str, str]
 ) -> dict[str, str | None]:
     """Tool or base that a place in the text sets, None: not known from it on.
 
     ``$IPO_MODE`` is #TCP, or empty where the tool is carried.
     """
     if (found["bas"] or "").upper() == "INITMOV":
-        return dict.fromkeys(("$TOOL", "$BASE", "$IPO_MODE"))
+        return dict.fromkeys(KINDS)
     here = f"{OF_LINE}{line}"  # of what is not read here: unknown
-    if found["mode"]:
-        return {"$IPO_MODE": _carried(found["mode"])}
+    if mode := found["mode"]:
+        told = _of_inline(mode, inline, here)
+        return {"$IPO_MODE": told["$IPO_MODE"] if told else _carried(mode)}
     if found["fdat"] is not None:  # for the BAS(#FRAMES) behind it
         word = found["fdat"].strip()
         body = word[1:-1] if word.startswith("{") else inline.get(word.upper(), "")
@@ -339,6 +449,8 @@ def _given(
     T = _frame(value[1:-1]) if re.fullmatch(r"\{[^{}]*\}", value) else None
     if T is not None:
         frames[name] = T
+    elif told := _of_inline(value, inline, here):
+        return {kind: told[kind]}
     elif not found["part"] and re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
         name = value.upper()
     return {kind: name}
@@ -347,6 +459,13 @@ def _given(
 def _carried(mode: str) -> str:
     """An IPO mode where the robot carries the part; else empty."""
     return mode.strip().upper() if mode.strip().upper() == "#TCP" else ""
+
+
+def _of_inline(value: str, inline: dict[str, str], here: str) -> dict[str, str | None]:
+    """What the FDAT sets that a value names as inline forms do; empty where it does not."""
+    named = _INLINE.fullmatch(value)
+    body = inline.get(named[1].upper()) if named else None
+    return {} if body is None else _of_fdat(body, here)
 
 
 def _of_fdat(body: str, here: str) -> dict[str, str | None]:
@@ -360,20 +479,37 @@ def _of_fdat(body: str, here: str) -> dict[str, str | None]:
 
 
 def _framed(
-    point: ProgramPoint, at: int, inline: dict[str, str], flow: Flow, within: list[_With]
+    point: ProgramPoint,
+    goals: Sequence[int],
+    inline: dict[str, str],
+    flow: Flow,
+    within: list[_With],
 ) -> ProgramPoint:
-    """The point with the names of its frames, and what about them forbids a correction."""
-    names = dict(flow.at(at))
+    """The point with the names of its frames, and what about them forbids a correction.
+
+    ``goals``: where motions go to it.
+    """
     body = inline.get("F" + point.name.upper().removeprefix("X"))
     if body is not None:
         names = _of_fdat(body, f"{OF_LINE}{point.line}")
     else:
-        for one in within:
-            if one.at <= at < one.until:
-                names |= one.names
+        each = [_in_force(at, flow, within) for at in goals]
+        names = each[0] if each else {}
+        if any(not flow.same(names.get(kind), one.get(kind)) for one in each for kind in KINDS):
+            words = "motions with different tools or bases go to it"
+            return replace(point, problem=point.problem or words)
     if mode := names.get("$IPO_MODE"):
         words = "the robot carries the part to a tool that stands"
         if mode != "#TCP":
             words = f"whether the robot carries the part is not known ({mode})"
         return replace(point, problem=point.problem or words)
     return replace(point, tool=names.get("$TOOL"), frame=names.get("$BASE"))
+
+
+def _in_force(at: int, flow: Flow, within: list[_With]) -> dict[str, str | None]:
+    """What is in force for the motion at a place."""
+    names = dict(flow.at(at))
+    for one in within:
+        if one.at <= at < one.until:
+            names |= one.names
+    return names

@@ -11,6 +11,7 @@ docs/programs.md.
 
 import re
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -123,7 +124,7 @@ def _targets(text: str, clean: str, frames: dict[str, Array]) -> list[_Target]:
             if fields is not None and len(fields) == 6 and not require_numbers(fields):
                 frames[tool] = pose_of("ur", [part.value for part in fields])
             steps.append(FlowStep(call.start(), "set", {SET_TCP: tool}))
-    flow, found = Flow(text, steps, frames), []
+    flow, found = Flow(partial(line_of, text), steps, frames), []
     for call, parts in calls:
         tool_there = flow.at(call.start()).get(SET_TCP)
         for part in parts[: TARGETS.get(call[1], 0)]:

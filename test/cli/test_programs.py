@@ -100,6 +100,33 @@ def test_a_tool_that_is_reckoned_is_not_that_of_the_same_line_elsewhere(folder: 
     assert "unknown tool $TOOL of line 2" in point["reason"]
 
 
+def test_a_data_list_is_read_with_the_program_beside_it(folder: Path, capsys):
+    """A way that only the program's LIN_REL tells from a place; the name is in other letters."""
+    words = ("weld.dat", *MODEL, *KNOWN)
+    _, alone = command(capsys, *words)
+    assert alone["module"] is None
+    assert ["weld.src" in warning for warning in alone["warnings"]] == [True]
+    (folder / "WELD.SRC").write_text("DEF WELD()\nPTP XP1\nLIN_REL XP2\nEND\n")
+    _, both = command(capsys, *words)
+    assert (both["module"], both["warnings"]) == ("WELD.SRC", [])
+    states = {point["name"]: point["state"] for point in both["points"]}
+    assert states == {
+        "XP1": "corrected", "XP2": "not_corrected", "XP3": "corrected", "XHOME1": "corrected",
+    }  # fmt: skip
+    assert both["points"][1]["reason"] == "the program reckons with it in line 3 of WELD.SRC"
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir()
+    (folder / "WELD.SRC").rename(elsewhere / "weld.src")
+    _, given = command(capsys, *words, "--module", "elsewhere/weld.src")
+    assert [point["state"] for point in given["points"]] == list(states.values())
+    status, document = command(capsys, *words, "--module", "none.src")
+    assert (status, document["error"]["file"]) == (2, "none.src")
+    (folder / "main.as").write_text(".PROGRAM main()\n.END\n")
+    status, document = command(capsys, "main.as", *MODEL, "--module", "weld.dat")
+    assert status == 2
+    assert "is one file" in document["error"]["message"]
+
+
 def test_points_of_another_group_are_told_by_name_and_hold_nothing_up(folder: Path, capsys):
     """As of a positioner that turns alone: no model of this robot says where it should be."""
     joints = ",\n".join(
