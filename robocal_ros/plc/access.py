@@ -299,7 +299,9 @@ class Trust:
         words = f"certificate {thumbprint[:16]} of {found.subject.rfc4514_string() or 'nobody'}"
         if not any(der == known for known in self._trusted()):
             kept = self._folder / REJECTED / f"{thumbprint}.der"
-            if not kept.exists() and len([*kept.parent.glob("*.der")]) < MOST_REJECTED:
+            if not kept.exists():
+                if len([*kept.parent.glob("*.der")]) >= MOST_REJECTED:
+                    return f"{words} is not trusted, and {REJECTED}/ is full: empty it, try again"
                 write_bytes(kept, der)
             return f"{words} is not trusted: move {REJECTED}/{kept.name} to {TRUSTED}/ to trust it"
         now = datetime.now(UTC)
