@@ -47,6 +47,7 @@ class SentPath:
 
     def scale(self, scaling: float, now_s: float) -> None:
         """From now on the controller's clock runs so fast, 0 to 1."""
+        now_s = min(now_s, self._stopped_s)  # what ended is driven no more, however fast
         since = max(self._since_s, self.begin_s)
         if now_s > since:
             self._lost_s += (1.0 - self._scaling) * (now_s - since)

@@ -286,6 +286,31 @@ def test_acknowledged_at_rest_readings_are_told_as_before(share: float, goes_on:
         assert np.abs(out.position[0] - at).max() <= ROUNDING
 
 
+@pytest.mark.parametrize("scaling", [0.0, 0.3])
+def test_a_path_that_ended_while_the_controller_paused_stays_ended_as_it_goes_on(
+    scaling: float,
+) -> None:
+    """Cancelled in a pause; how fast the controller's clock runs later moves nothing of it."""
+    robot = large()
+    session = robot.session
+    session.trajectory(swing(), robot.now)
+    path = session.output.path
+    assert path is not None
+    robot.now += 1.0
+    session.controller((), np.empty(0), scaling, robot.now)
+    robot.now += 0.3
+    path.end(robot.now)
+    robot.at = path.place(robot.now)
+    robot.rest()
+    before, withheld = robot.read(robot.at).position, session.offset(robot.now).withheld
+    for factor in (1.0, 0.5):
+        session.controller((), np.empty(0), factor, robot.now)
+        robot.rest()
+        assert np.array_equal(path.place(robot.now), robot.at)
+        assert np.array_equal(session.offset(robot.now).withheld, withheld)
+        assert np.array_equal(robot.read(robot.at).position, before)
+
+
 @pytest.mark.parametrize("rates", [None, np.zeros((1, 6))], ids=["lines", "cubics"])
 def test_a_stream_of_single_points_has_its_offset_when_it_has_come_in(
     rates: np.ndarray | None,
