@@ -399,7 +399,7 @@ class JointCorrectionNode(RobotNode):
             and self._session.moves(now)
         ):
             allowed = f"allowed {MOST_TOPIC_POINTS_IN_MOTION} while the robot is being moved"
-            raise RefusedError(Reason.BURST, f"{message.points}, {allowed}")
+            self._session.refuse(Reason.BURST, f"{message.points}, {allowed}")
         self._put_out(TRAJECTORY, message, *self._corrected(message))
         self._by_action = False
         if self._proxy is not None:  # a controller would call a goal reached by another path's end

@@ -30,6 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+from robocal_ros.correction.interface import Reason
 from robocal_ros.correction.node import MOST_TOPIC_POINTS_IN_MOTION, JointCorrectionNode
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.ros import conversions, endpoints
@@ -335,6 +336,8 @@ def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
     for many in (MOST_TOPIC_POINTS_IN_MOTION + 1, 10_001):  # they would hold a stop up
         q = HOME + np.linspace(0.0, 0.1, many)[:, None]
         line.refused(line.to_path, trajectory(q, np.arange(1, many + 1) * 1e-3), "joint_trajectory")
+        told = session.status().last_refusal
+        assert f"{Reason.BURST.value}: {many}, allowed" in told
     assert distance(actual, out.points[0].positions) < 1e-9
 
 
