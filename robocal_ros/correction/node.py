@@ -144,8 +144,8 @@ class JointCorrectionNode(RobotNode):
             topic: self.add_output(kind, f"~/{topic}", endpoints.RELIABLE)
             for topic, kind in KINDS.items()
         }
-        self.add_input(KinematicModel, MODEL, self._on_model, endpoints.LATCHED)
-        self.add_input(ToolFrame, TOOL, self._on_tool, endpoints.LATCHED)
+        self.add_input(KinematicModel, MODEL, self._on_model, endpoints.LATCHED, kept=True)
+        self.add_input(ToolFrame, TOOL, self._on_tool, endpoints.LATCHED, kept=True)
         self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED_OF_SEVERAL)
         self.add_input(Float64, SCALING, self._on_scaling, endpoints.NEWEST)
         self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)

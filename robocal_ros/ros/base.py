@@ -4,7 +4,7 @@
 A node names its parameters in ``SETTINGS`` and fills in four hooks:
 
 - ``configure``: read ``self.settings``, open what is needed, create inputs, outputs, services;
-- ``activate`` and ``deactivate``: start and stop acting (inputs are ignored while inactive);
+- ``activate`` and ``deactivate``: start and stop acting (inactive, inputs are ignored or kept);
 - ``cleanup``: release what ``configure`` opened; also called when ``configure`` failed half-way
   and when the process ends.
 
@@ -133,6 +133,7 @@ class HouseNode(EndpointNode):
         if result == TransitionCallbackReturn.SUCCESS:
             self.is_active = True
             self._log_identity("active")
+            self.take_kept()
         else:
             super().on_deactivate(state)
         return result

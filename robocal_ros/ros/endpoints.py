@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -159,6 +160,7 @@ class EndpointNode(LifecycleNode):
         self._release: list[Callable[[], object]] = []
         self._takers: list[tuple[str, Subscription, Callable[..., None], Callable[..., None]]] = []
         self._taking = False
+        self._kept: dict[str, Callable[[], None]] = {}  # by topic, for the next activation
 
     @property
     def state(self) -> str:
@@ -192,6 +194,7 @@ class EndpointNode(LifecycleNode):
         raw: bool = False,
         timed: bool = False,
         numbered: bool = False,
+        kept: bool = False,
     ) -> Subscription:
         """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
 
@@ -199,20 +202,26 @@ class EndpointNode(LifecycleNode):
         the callback is given the serialized message; ``timed``: also what rclpy knows of it, its
         ``source_timestamp`` (ns) among that. ``numbered``: what was lost is counted by the
         publisher's numbers, also what the queue had no room for. Neither goes with an events
-        executor, which ends at a callback of two arguments (rclpy 7).
+        executor, which ends at a callback of two arguments (rclpy 7). ``kept``: of what comes while
+        the node is inactive the last one is taken once it is active: latched, it comes only once.
         """
         count = self.inputs.setdefault(topic, InputCount())
 
-        def take(message: Any, *info: Any) -> None:
-            count.received += 1
-            if not self.is_active:
-                count.ignored += 1
-                return
+        def give(message: Any, *info: Any) -> None:
             try:
                 callback(message, *info)
             except Exception as error:
                 count.invalid += 1
                 self._log(topic, error)
+
+        def take(message: Any, *info: Any) -> None:
+            count.received += 1
+            if self.is_active:
+                give(message, *info)
+            elif kept:
+                self._kept[topic] = partial(give, message, *info)
+            else:
+                count.ignored += 1
 
         def note(info: Any) -> None:
             count.lost += numbers.missed(info) if numbered else 0
@@ -240,6 +249,12 @@ class EndpointNode(LifecycleNode):
         self._takers.append((topic, subscription, note, take))
         self._release.append(lambda: self.destroy_subscription(subscription))
         return subscription
+
+    def take_kept(self) -> None:
+        """Take what was kept while the node was inactive."""
+        kept, self._kept = self._kept, {}
+        for give in kept.values():
+            give()
 
     def take_waiting(self, *topics: str, pick: Callable[[list[Any]], Iterable[Any]] = iter) -> None:
         """Take now what the inputs have received, in place of one message of each in its turn.
@@ -343,6 +358,7 @@ class EndpointNode(LifecycleNode):
     def release_endpoints(self) -> None:
         """Take down all of them, the last one first."""
         self._takers.clear()
+        self._kept.clear()
         while self._release:
             self._release.pop()()
 
