@@ -195,28 +195,37 @@ class SeenStop:
         at_s, speed = own.controller.speeds(begin_s)
         return cls(late_s, stood, at_s, speed * np.sign(way))
 
+    def judge(self, allowed_s: float) -> None:
+        """It is even, as one that waited so long at most may be."""
+        assert self.stood["sent"] == 1 or allowed_s > STARVED_S
+        assert self.stood["took_s"] < 1.5 * self.stood["planned_s"] + min(self.late_s, allowed_s)
+        assert np.min(self.speed) > -1e-3
+        assert np.max(self.speed) < 1.05
+        # At once it would be 250, and 40 to 220 where the controller begins at the measured
+        # position; one that is late makes up for it in one of its steps.
+        harder = np.diff(self.speed, axis=0) / np.diff(self.at_s)[:, None]
+        assert np.max(np.abs(harder)) < SLOW * (1.0 + allowed_s / TICK_S)
+
 
 @pytest.mark.parametrize("own", [*POSITIONS, LAGGING, *more(*VELOCITIES)], indirect=True)
 def test_a_stop_slows_down_evenly_and_never_goes_back(own):
-    """Done anew where a busy computer had it wait; judged by the one that waited least."""
-    seen = [SeenStop.of(own)]
-    while seen[-1].late_s >= LATE_S and len(seen) < TRIES:
-        seen.append(SeenStop.of(own))
+    """Done anew where a busy computer had it wait; at last the one that waited least counts."""
+    seen = []
+    for _ in range(TRIES):
+        seen.append(stop := SeenStop.of(own))
+        try:
+            stop.judge(LATE_S)
+            return
+        except AssertionError:
+            if stop.late_s < LATE_S:
+                raise
     stop = min(seen, key=lambda one: one.late_s)
-    late_s = max(stop.late_s, LATE_S)
-    assert stop.stood["sent"] == 1 or late_s > STARVED_S
-    assert stop.stood["took_s"] < 1.5 * stop.stood["planned_s"] + stop.late_s
-    assert np.min(stop.speed) > -1e-3
-    assert np.max(stop.speed) < 1.05
-    # At once it would be 250, and 40 to 220 where the controller begins at the measured position;
-    # one that is late makes up for it in one of its steps.
-    harder = np.diff(stop.speed, axis=0) / np.diff(stop.at_s)[:, None]
-    assert np.max(np.abs(harder)) < SLOW * (1.0 + late_s / TICK_S)
+    stop.judge(stop.late_s)
 
 
 @pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC, *more(UNTOLD)], indirect=True)
 def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
-    """Done anew where a busy computer hid for long how the robot slows down."""
+    """Done anew what a busy computer, which hid how the robot slows down, has kept from it."""
     for slow, how in (
         (10.0, {"lost": 1}),  # planned: 0.12 s
         (10.0, {"lost": 2}),
@@ -229,15 +238,16 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
             stood = own.stopped()
             starved_s = own.graph.starved_s(waits)
             own.arrive()
-            if starved_s < STARVED_S:
+            assert stood["failed"] == "", (how, starved_s)
+            # Once more where a busy computer hides for 20 ms that it slows down: no harm in that.
+            anew = how.get("rejected", how.get("lost") == COPIES)
+            more_often = stood["sent"] - 1 - anew
+            late_s = stood["took_s"] - 1.5 * stood["planned_s"]
+            if starved_s < STARVED_S or (0 <= more_often <= 1 and late_s < 0.0):
                 break
             own.graph.calm()
-        assert stood["failed"] == "", (how, starved_s)
-        # Once more where a busy computer hides for 20 ms that it slows down: that does no harm.
-        anew = how.get("rejected", how.get("lost") == COPIES)
-        more_often = stood["sent"] - 1 - anew
         assert 0 <= more_often <= 1 or (more_often > 1 and starved_s > STARVED_S), (how, starved_s)
-        assert stood["took_s"] < 1.5 * stood["planned_s"] + starved_s, (how, stood)
+        assert late_s < starved_s, (how, stood)
 
 
 @pytest.mark.parametrize("own", [*POSITIONS, *more(BY_TOPIC)], indirect=True)
