@@ -238,14 +238,15 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
             stood = own.stopped()
             starved_s = own.graph.starved_s(waits)
             own.arrive()
-            assert stood["failed"] == "", (how, starved_s)
             # Once more where a busy computer hides for 20 ms that it slows down: no harm in that.
             anew = how.get("rejected", how.get("lost") == COPIES)
             more_often = stood["sent"] - 1 - anew
             late_s = stood["took_s"] - 1.5 * stood["planned_s"]
-            if starved_s < STARVED_S or (0 <= more_often <= 1 and late_s < 0.0):
+            well = stood["failed"] == "" and 0 <= more_often <= 1 and late_s < 0.0
+            if well or starved_s < STARVED_S:
                 break
             own.graph.calm()
+        assert stood["failed"] == "", (how, starved_s)
         assert 0 <= more_often <= 1 or (more_often > 1 and starved_s > STARVED_S), (how, starved_s)
         assert late_s < starved_s, (how, stood)
 
