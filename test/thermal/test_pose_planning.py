@@ -121,7 +121,8 @@ def test_moving_the_sensor_frame_changes_nothing(arm, candidates):
     turned = frames.transform(frames.exp_rotation([0.3, 1.0, -0.2]), [1.0, 2.0, 3.0])
     moved = CellModel(arm, turned @ cell.T_frame_base, cell.targets, cell.T_flange_target)
     here, there = design_of(arm, candidates), design_of(arm, candidates, moved)
-    assert choose(here, 4) == choose(there, 4)
+    # Which they are: of starts that end at the same ones, rounding picks, and with it the order.
+    assert sorted(choose(here, 4)) == sorted(choose(there, 4))
     assert here.error([1, 2, 3]) == pytest.approx(there.error([1, 2, 3]), rel=1e-9)
 
 
