@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, settings
 gc.disable()  # until all tests are read: nothing of them is garbage
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "test" / "worlds"))  # what tests share: cells, robots, recordings
+from long_form import LONG  # noqa: E402
 from measured_cell import cell, known_set_up, make_cell_fixture  # noqa: E402, F401
 from shift import arm, nominal  # noqa: E402, F401
 
@@ -53,7 +54,11 @@ def pytest_make_collect_report(
     return report
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not LONG:
+        left_out = [item for item in items if item.get_closest_marker("long")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("long")]
     folder = find_data()
     if folder.is_dir():
         return

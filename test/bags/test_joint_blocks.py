@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from long_form import amount
 from mcap.writer import CompressionType, Writer
 
 from robocal_ros.bags import bag_writer
@@ -68,7 +69,7 @@ def joint_states(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=amount(15, 60), deadline=None)
 @given(
     runs=st.lists(st.tuples(joint_states(), st.integers(1, 9)), min_size=1, max_size=12),
     seed=st.integers(0, 1000),

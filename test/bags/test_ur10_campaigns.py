@@ -72,6 +72,7 @@ def test_table_and_bag_say_the_same(campaign: Measurements, data_dir: Path, tmp_
     np.testing.assert_allclose([o.sample.rotation for o in observed], table.rotation, atol=1e-11)
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.parametrize(("series", "visits"), [("D", 1), ("B", 2)])
 def test_halves_keep_visits_of_a_pose_together(data_dir: Path, series: str, visits: int) -> None:
@@ -87,6 +88,7 @@ def test_halves_keep_visits_of_a_pose_together(data_dir: Path, series: str, visi
     assert again[0].sample == train.sample
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_series_a_is_put_in_order_of_its_clock(data_dir: Path) -> None:
     data = ur10_campaigns.load_campaign("A", data_dir / "ur10_tmac")

@@ -162,6 +162,7 @@ def test_bounces_and_lost_edges():
     assert lost.edges(tool, move, move.window, rng()) == []
 
 
+@pytest.mark.long
 def test_repeatability_shifts_a_step_and_scatters_edges():
     """A sweep at 10 mm/s: middle of a shadow scatters by the step, its width by the edges."""
     start = UPRIGHT.copy()

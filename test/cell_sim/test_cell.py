@@ -66,6 +66,7 @@ def test_a_programmed_circle_has_the_edges_of_the_same_circle_as_geometry():
     assert times == pytest.approx([e.time_s - move.start_s for e in wanted], abs=1e-8)
 
 
+@pytest.mark.long
 def test_each_motion_has_its_own_scatter():
     cell = SimulatedCell(plan_of(noise=TrueNoise(3e-5, 0.0)))
     off = []
@@ -160,6 +161,7 @@ def test_the_seed_tells_everything_whenever_the_cell_is_asked():
     assert one[1] != new[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("fault", "x", "y"),
     [

@@ -90,6 +90,7 @@ def test_every_fault_is_looked_at():
     assert len(healthy["ball"]) == 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", TOUCHED)
 def test_a_fault_touches_what_it_names_alone(fault):
     healthy, faulty = tour(), tour(fault, 0.8 if fault == "lost_messages" else 0.0)
@@ -97,6 +98,7 @@ def test_a_fault_touches_what_it_names_alone(fault):
     assert touched == TOUCHED[fault]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0.1, 1.0, 5.0])
 def test_a_collision_bends_the_tool_by_its_size(size):
     T = tour("collision", size)["tool"]
@@ -122,6 +124,7 @@ def shadows(told, beam: str | None = None):
     return np.array(found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0.3, 2.0])
 def test_a_knocked_sensor_sees_both_spheres_moved_alike(size):
     healthy, knocked = tour(), tour("sensor_knocked", size)
@@ -138,6 +141,7 @@ def test_a_knocked_ball_is_off_by_its_size():
     assert np.linalg.norm(off, axis=1) == pytest.approx(np.full(2, 0.7e-3), rel=1e-3)
 
 
+@pytest.mark.long
 def test_dirt_lengthens_the_shadows_of_its_beam():
     healthy, dirty = tour(), tour("beam_dirty", 0.4)
     assert np.all(shadows(dirty, "x") > shadows(healthy, "x") + 1e-3)
@@ -157,6 +161,7 @@ def test_exchanged_cables_exchange_the_beams():
     assert swapped == [(e.beam, e.blocked, e.time_s) for e in tour()["edges"]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.1, 0.5])
 def test_messages_are_lost_at_random(share):
     healthy, left = tour(), tour("lost_messages", share)
@@ -168,6 +173,7 @@ def test_messages_are_lost_at_random(share):
     assert {e.time_s for e in left["edges"]} < {e.time_s for e in healthy["edges"]}
 
 
+@pytest.mark.long
 def test_clocks_step():
     assert tour("clock_jump", -2.0)["stamps"] == pytest.approx(tour()["stamps"] - 2.0)
     jumped = tour("sensor_clock_jump", 3.0)["shot stamps"]
@@ -250,6 +256,7 @@ def test_the_next_encoder_that_stands_still_shows_its_own_joint():
         assert np.max(np.delete(off, joint, axis=1)) < 1e-5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("fault", "size"),
     [

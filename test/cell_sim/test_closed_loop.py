@@ -111,6 +111,7 @@ def reference_measured_late(plant, suite):
     return plant.measure_tool(suite, REFERENCE, "one")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [51, *more(65, 73)])
 def test_a_healthy_tool_is_found_where_noisy_readings_bend_its_path(seed):
     """Joint readings whose noise lets whole steps of the search overshoot for ever."""
@@ -153,6 +154,7 @@ def test_poses_before_a_collision_within_a_pass_are_made_with_the_healthy_tool()
     assert sizes(after).min() > TOOL_M
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("at_s", [BEGINS_S, BEGINS_S - 20.0])
 def test_a_collision_in_a_gap_befalls_the_whole_pass_after_it(at_s):
     _, hit, _ = run_shift(plan(Incident(at_s, "collision", 2.0)), seed=3, suite=False).passes

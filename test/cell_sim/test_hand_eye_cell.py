@@ -65,6 +65,7 @@ def test_views_are_turned_as_far_as_asked():
     assert 0.15 < tilt.max() <= np.hypot(0.2, 0.2)
 
 
+@pytest.mark.long
 def test_reported_poses_scatter_as_told():
     """60 poses, 180 numbers: a standard deviation is known to 5.3 %."""
     cell = HandEyeCell(sensor=QUIET, robot=PoseRobot(1e-4, 1e-3))

@@ -91,6 +91,7 @@ def pieces(begin, end, rng=None):
     return [*inside.tolist(), end]
 
 
+@pytest.mark.long
 def test_the_seed_tells_everything_however_time_is_cut():
     whole, cut = run(lambda begin, end: [end]), run(pieces)
     assert len(whole[1]) > 3
@@ -101,12 +102,14 @@ def test_the_seed_tells_everything_however_time_is_cut():
     assert run(pieces, seed=4)[3] != whole[3]
 
 
+@pytest.mark.long
 def test_without_readings_all_else_is_the_same():
     whole, without = run(pieces), run(pieces, readings=False)
     assert without[0] == [[], [], []]
     assert without[1:4] == whole[1:4]
 
 
+@pytest.mark.long
 def test_work_warms_the_robot_and_a_break_cools_it():
     cell = cell_of()
     worked(cell, 0.08)

@@ -21,6 +21,7 @@ EARLY, LATE = (Incident(at_s, "collision", 2.0) for at_s in (170.0, 330.0))
 PLAN = ShiftPlan(hours=3.0 * EVERY_S / 3600.0, every_s=EVERY_S)
 
 
+@pytest.mark.long
 def test_a_trial_from_a_shared_begin_is_the_trial_run_whole():
     """Bit for bit: a child writes into a history of its own, and draws what the trial draws."""
     hours = (SHARED_S + EVERY_S) / 3600.0
@@ -33,6 +34,7 @@ def test_a_trial_from_a_shared_begin_is_the_trial_run_whole():
         assert pickle.dumps(record) == pickle.dumps(run_shift(plan, SEED))
 
 
+@pytest.mark.long
 def test_what_goes_wrong_at_different_times_is_shared_until_the_first():
     plans = [replace(PLAN, incidents=one) for one in ((), (EARLY, LATE), (LATE,))]
     jobs = [(plan, SEED, False) for plan in plans]

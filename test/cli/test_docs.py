@@ -11,9 +11,12 @@ from pathlib import Path
 
 import pytest
 from command import ROOT, environment, robocal
+from long_form import more
 
 PREFIX = ".venv/bin/robocal "
-PAGES = [f"docs/{name}.md" for name in ("README", "install", "identify", "history", "replay")]
+PAGES = [
+    f"docs/{name}.md" for name in ("README", "install", *more("identify", "history", "replay"))
+]
 # Sections of docs/replay.md that show what their first command prints.
 SHOWN = ("replay", "validate")
 REPLAY = ("replay", "bags/demo_shift.mcap", "--robot", "kr150_r3100", "--auto")
@@ -69,6 +72,7 @@ def test_the_thermal_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.Monk
     assert printed["identify"].splitlines()[0] in (ROOT / "docs/thermal.md").read_text()
 
 
+@pytest.mark.long
 def test_the_hand_eye_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("bags").symlink_to(ROOT / "bags")

@@ -139,6 +139,7 @@ class TestRecovered:
         names = {name.split("/")[0] for name in found["residual_mm"]["per_sample"]}
         assert names == set(found["target"]) == {"sphere", "step", "line"}
 
+    @pytest.mark.long
     def test_other_shots_judge_several_targets_together(self, made, checked, together, tmp_path):
         found, words = together, ["--sphere", made / "sphere", "--line", tmp_path / "line"]
         shutil.copytree(made / "line", tmp_path / "line")
@@ -164,6 +165,7 @@ class TestRecovered:
             failed = robocal("joint", *HEIGHTS, *words, "--check", name, status=2)
             assert said in failed["error"]["message"]
 
+    @pytest.mark.long
     def test_what_tells_the_sensor_is_read_once(self, made, tmp_path, monkeypatch):
         file, read = tmp_path / "sensor.yaml", []
         file.write_text("z_grows: towards\n")

@@ -367,6 +367,7 @@ class TestUsage:
         assert words in document["error"]["message"]
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_recording(folder: Path, visits) -> None:
     """Twenty times the joint readings: the same memory to a few megabytes."""
 

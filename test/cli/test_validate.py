@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from campaign import POINTS, ROBOT, postures, true_arm
 from command import ROOT, beyond_rounding, conforms
+from long_form import more
 from recordings import (
     BETWEEN_S,
     EVENTS,
@@ -169,6 +170,7 @@ class TestRecordedSession:
         assert in_force < 0.6 * without  # 20 of 30 K are known
         assert second["forecast"]["bound_mm"] > second["forecast"]["rms_mm"] > 0.0
 
+    @pytest.mark.long
     def test_another_payload_than_the_models_is_told_once(self, validate, tmp_path) -> None:
         """As of the robot file: the hash of a model does not hold what the arm carries."""
         load = ArmLoad(np.ones(6), np.zeros((6, 3)), 10.0, np.array([0.0, 0.0, 0.1]))
@@ -258,6 +260,7 @@ class TestRecordedSession:
 
 
 class TestTruth:
+    @pytest.mark.long
     def test_true_errors_of_a_drift_that_was_made(self, bags, validate) -> None:
         status, document, _, report = validate(*judged(bags))
         assert status == 0
@@ -453,6 +456,7 @@ class TestInParallel:
         assert status == 2
         assert "no worker within 1 s" in document["error"]["message"]
 
+    @pytest.mark.long
     def test_bags_that_a_cluster_took_with_it_are_told(self, validate) -> None:
         from distributed import LocalCluster
 
@@ -484,7 +488,7 @@ class TestInParallel:
         assert "1 of 2 bags could not be validated" in document["error"]["message"]
         assert "was killed, for want of memory? Try --jobs 1" in document["error"]["message"]
 
-    @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+    @pytest.mark.parametrize("how", [signal.SIGKILL, *more(signal.SIGTERM)])
     def test_no_worker_outlives_the_command(self, tmp_path, how) -> None:
         process = validating(tmp_path / "report")
         process.send_signal(how)

@@ -10,6 +10,7 @@ import numpy as np
 from correction_robot import DT, HOME, NAMES, Robot, bent_tool, drifted, offer, swing
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from long_form import amount
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
@@ -155,7 +156,7 @@ def _act(
     return acts.get(event, send)
 
 
-@settings(max_examples=60)
+@settings(max_examples=amount(20, 60))
 @given(PARTS, st.booleans(), st.sampled_from(MARKS), st.integers(0, 2**16))
 def test_a_usual_target_comes_to_what_the_long_way_comes_to(
     parts: list[tuple[int, float, str]], rates: bool, mark: str, seed: int

@@ -66,6 +66,7 @@ print(float(T[0, 0, 3]), sum(sum(k.stats.cache_hits.values()) for k in (fk_batch
 """
 
 
+@pytest.mark.long
 def test_a_kernel_is_built_from_kept_code_and_made_again_where_that_is_gone_or_edited(tree):
     right = pytest.approx(0.8775825618903728, abs=1e-15)
     assert walk(tree, CALLER) == (right, 0)
@@ -196,6 +197,7 @@ def read_only(tree: Path) -> list[str]:
     return before
 
 
+@pytest.mark.long
 def test_a_read_only_tree_without_a_home_keeps_its_code_in_a_private_folder(
     tree: Path, read_only: list[str], tmp_path: Path
 ) -> None:
@@ -213,6 +215,7 @@ def test_a_read_only_tree_without_a_home_keeps_its_code_in_a_private_folder(
     assert any("cannot be kept" in words for words in open_to_all["told"])
 
 
+@pytest.mark.long
 def test_code_that_was_compiled_at_the_installation_is_used_from_a_read_only_tree(
     tree: Path, read_only: list[str], tmp_path: Path, kept: Path
 ) -> None:

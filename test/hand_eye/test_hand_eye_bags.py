@@ -130,6 +130,7 @@ def target_file(path: Path) -> tuple[str, list[float]]:
     return NUMBER.sub("#", text), [float(number) for number in NUMBER.findall(text)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_its_script_makes_it_again(script, recordings, tmp_path, kind):
     again = tmp_path / "again.mcap"

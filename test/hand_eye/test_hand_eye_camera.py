@@ -154,6 +154,7 @@ def test_unknown_noise_of_both_sides_is_found(seed, mount, truth, tolerance) -> 
 ANY_AXIS = BoardNoise(2e-4, 3e-4, (2e-4, 2e-4, 2e-4), (6e-4, 6e-4, 6e-4))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [BoardNoise(), ANY_AXIS], ids=["along the axis", "any axis"])
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_noise_that_is_estimated_costs_little(mount: str, noise: BoardNoise) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from camera_pairs import EXACT, KNOWN, MOUNTS, error, measured
+from long_form import more
 from scipy.stats import binom, chi2, f
 
 from bench.hand_eye_cell import BoardCell, BoardNoise, TruePose
@@ -224,7 +225,7 @@ PLACES = BoardNoise(3e-4, 1e-6, (3e-4,) * 3, (1e-6,) * 3)  # all of it
 
 
 @pytest.mark.parametrize("noise", [BoardNoise(), PLACES], ids=["as usual", "of positions alone"])
-@pytest.mark.parametrize("count", [3, 4, 5])
+@pytest.mark.parametrize("count", [3, *more(4, 5)])
 def test_the_expected_error_of_few_poses_holds(count: int, noise: BoardNoise) -> None:
     """Whatever their noise is of.
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from long_form import amount
+from long_form import amount, more
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import HandEyeCell
@@ -45,9 +45,7 @@ def squared_errors(made: Calibration) -> tuple[float, float, float]:
     return float(alone), float(both), said.factor**2
 
 
-@pytest.mark.parametrize(
-    "make", [step_set, sphere_set, edge_set], ids=["stairs", "sphere", "unknown edge"]
-)
+@pytest.mark.parametrize("make", [sphere_set, *more(step_set, edge_set)])
 def test_sigmas_of_a_mount_hold_with_gears(make: Make):
     """By chi-square of six numbers a draw, with what the verdict says that gears add.
 

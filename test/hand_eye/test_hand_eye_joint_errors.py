@@ -78,6 +78,7 @@ def squared_error(fit: MountFit, covariance) -> float:
     return float(step @ np.linalg.solve(covariance, step)) / 6.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("make", "tilt_deg", "least"),
     [(sphere_set, 6.0, 1.6), (sphere_set, 25.0, 1.1), (edge_set, 25.0, 1.1)],

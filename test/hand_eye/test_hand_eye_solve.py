@@ -304,6 +304,7 @@ class TestLine:
         sigma = expected_error_m(found.covariance, np.array([[0.0, 0.0, 0.2]]) - found.pivot)
         assert np.linalg.norm(across) < 4.0 * sigma + 1e-4  # and what the robot repeats to
 
+    @pytest.mark.long
     @pytest.mark.parametrize("known", [True, False])
     def test_starts_that_are_given_up_lead_to_no_better_place(self, known):
         """Nor to another that is nearly as good: each start followed to its end."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from camera_tables import moving_flange
+from long_form import more
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -39,7 +40,7 @@ def recorded(offset_s: float, mount: str, seed: int, noise: BoardNoise = NOISE, 
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("offset_s", [0.0, 0.137, -3.2])
+@pytest.mark.parametrize("offset_s", [0.137, *more(0.0, -3.2)])
 def test_offset_and_camera_are_found(offset_s: float, mount: str) -> None:
     cell, robot, camera = recorded(offset_s, mount, 1)
     assert coarse_offset(robot, camera) == pytest.approx(offset_s, abs=0.05)
@@ -64,6 +65,7 @@ def test_without_noise_the_offset_is_exact() -> None:
     assert pair_streams(robot, camera).offset_s == pytest.approx(0.05, abs=2e-5)
 
 
+@pytest.mark.long
 def test_outliers_and_ends_are_named() -> None:
     cell, robot, camera = recorded(0.2, "in-hand", 3)
     T = camera.T.copy()
@@ -96,6 +98,7 @@ def test_a_pause_of_the_robot_is_not_bridged() -> None:
     assert all(7.95 < times[name] < 10.05 for name in found.left_out)
 
 
+@pytest.mark.long
 def test_check_poses_of_another_time_judge() -> None:
     _, robot, camera = recorded(0.1, "in-hand", 5)
     half = len(robot.time_s) // 2
@@ -111,6 +114,7 @@ def test_check_poses_of_another_time_judge() -> None:
     assert len(found.samples) + len(found.rejected) + held == len(camera.names)
 
 
+@pytest.mark.long
 def test_check_poses_are_named_where_they_belong() -> None:
     """A pause of the check is its own; before the robot's first pose nothing judges."""
     _, robot, camera = recorded(0.0, "in-hand", 5)

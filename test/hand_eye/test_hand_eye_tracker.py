@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from long_form import more
 
 from bench.hand_eye_tracker import spread
 from bench.laser_tracker import TrackerCell, prp_cell, six_axis_cell
@@ -67,7 +68,7 @@ def clean(method: str = "best"):
     return solve(noisy(), method)
 
 
-@pytest.mark.parametrize("kind", ["prp", "ur10"])
+@pytest.mark.parametrize("kind", ["ur10", *more("prp")])
 def test_measurements_without_noise_give_the_truth(kind):
     """To rounding; the closed form to where its iteration stops."""
     made = cell(kind)
@@ -94,6 +95,7 @@ def left_out(data: TrackerData, row: int) -> TrackerData:
     return replace(data, q=data.q[rest], profiles=[data.profiles[i] for i in rest])
 
 
+@pytest.mark.long
 def test_leaving_a_profile_out_is_as_solving_without_it():
     """Not the first one: the motion counts from there."""
     made, (problem, estimate, _) = cell("prp"), solved()
@@ -115,6 +117,7 @@ def test_leaving_a_profile_out_is_as_solving_without_it():
     assert away_m < 0.25 * moved_m  # the noise of the sensor is estimated anew
 
 
+@pytest.mark.long
 def test_leave_one_out_is_filled_by_both_methods():
     """The distance of a profile's own points hardly changes, and never to the better as a whole."""
     for method in ("best", "classic"):
@@ -136,6 +139,7 @@ def test_a_profile_that_alone_tells_something_is_not_left_out():
     assert states_without(problem, replace(alone, covariance=covariance), names)[0] is None
 
 
+@pytest.mark.long
 def test_classic_is_judged_by_its_distance_from_the_best():
     best, classic = clean(), clean("classic")
     points = np.concatenate([profile.points for profile in noisy().profiles])
@@ -158,6 +162,7 @@ def test_classic_is_judged_by_its_distance_from_the_best():
     assert "use method best" in verdict.reason
 
 
+@pytest.mark.long
 def test_a_fit_that_crept_on_judges_no_closed_form(monkeypatch):
     """The closed form is as far from it as it says, and what it crept towards is not known."""
 
@@ -188,6 +193,7 @@ def repeated(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(best), np.array(classic), np.array(covariance)
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_the_covariance_says():
     """Chi-square of 6 n degrees of freedom, within 4 sigma either way."""
     best, _, covariance = repeated("prp")
@@ -253,6 +259,7 @@ def test_the_adjoint_carries_twists_across_a_transform():
     assert np.allclose(left, right, atol=1e-13)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["best", "classic"])
 def test_where_the_tracker_stands_does_not_matter(method):
     data = noisy()
@@ -305,6 +312,7 @@ def test_a_wild_tracker_point_is_named_and_left_out():
     assert np.all(np.abs(away[:3, 3]) < sigma[:3])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("off_deg", [0.1, -0.05])
 def test_axes_that_are_not_quite_square(off_deg):
     """Named, not rejected; the flange is midway between what either axis says."""
@@ -361,6 +369,7 @@ def smoothed() -> list:
     return found
 
 
+@pytest.mark.long
 def test_noise_that_neighbours_share_is_no_misfit_of_honest_profiles():
     for one in smoothed():
         assert not one.rejected  # 0.01 each by chance
@@ -377,6 +386,7 @@ def with_arc(which: int, arc: Arc) -> TrackerData:
     return replace(noisy(), arcs=(arcs[0], arcs[1]))
 
 
+@pytest.mark.long
 def test_a_table_and_a_stem_in_the_field_do_no_harm():
     """With all the sensor's depth, dropouts, and light that is mirrored to another place."""
     made = cell("prp")
@@ -485,6 +495,7 @@ def test_profiles_with_x_reversed_are_of_a_sensor_that_is_turned_about_its_beam(
     assert np.all(np.abs(away[:3, 3]) < np.sqrt(np.diag(clean().covariance))[:3])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["best", "classic"])
 def test_a_sensor_that_tells_heights_is_placed_in_its_own_axes(method):
     """z = 0 lies 0.2 m before the other's origin; y follows by the right-hand rule."""
@@ -518,6 +529,7 @@ def test_another_face_of_the_cube_is_no_match():
         solve(replace(noisy(), faces=(noisy().faces[0], points)))
 
 
+@pytest.mark.long
 def test_an_edge_square_to_the_slide_leaves_two_answers():
     made = replace(cell("prp"), edge_rad=np.radians(90.0), lean_rad=0.0)
     with pytest.raises(RankDeficientError, match="two mountings") as caught:

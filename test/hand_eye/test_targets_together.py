@@ -92,6 +92,7 @@ def test_of_three_the_one_that_has_moved_is_named_and_its_doubt_counts():
     assert strict.verdict.code is Code.RESIDUAL_TOO_LARGE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size_m", [1e-3, *more(5e-4, 2e-3)])
 def test_a_sphere_that_was_pushed_amid_its_shots_is_said_with_the_shot(size_m):
     rng = np.random.default_rng(5)
@@ -112,6 +113,7 @@ def test_a_sphere_that_was_pushed_amid_its_shots_is_said_with_the_shot(size_m):
     assert "contradicts" not in found.verdict.reason
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("settings", [SETTINGS, *more(GIVEN)])
 def test_targets_that_agree_are_not_doubted(settings, monkeypatch):
     """As seldom as is said: chances below 5 % come in 5 % of the sets."""

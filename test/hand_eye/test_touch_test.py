@@ -146,6 +146,7 @@ def tables(tmp_path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_results_of_few_and_of_many_shots_side_by_side(tables):
     document = robocal_json(
         "hand-eye.verify.json", "hand-eye", "verify", "--target-kind", "point",

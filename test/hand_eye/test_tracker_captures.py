@@ -43,6 +43,7 @@ def knocked(mark: str) -> list[Capture]:
     return shots
 
 
+@pytest.mark.long
 def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
     captured(driver, captures())
     outcome = driver.ask(events.CALIBRATE)
@@ -70,6 +71,7 @@ def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
     assert repeated.document == document
 
 
+@pytest.mark.long
 def test_a_sensor_that_tells_heights_is_found_too(tmp_path):
     with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
         config = HandEyeConfig(sensor_frame=FRAME, sensor=LASER)

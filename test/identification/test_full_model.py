@@ -268,6 +268,7 @@ def test_rejected_samples_do_not_pull_a_bound_out():
         assert full_model.bound_squared(squared, keep) == own[rank - 1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "heavy"), [(120, True), (300, False), *more((120, False), (300, True))]
 )
@@ -301,6 +302,7 @@ def test_a_robot_that_only_sags_has_compliances_alone():
     assert rms_mm(found, check) < 0.5 * rms_mm(plain, check)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("gears", "sag"), [(False, True), (True, True), *more((True, False))])
 def test_each_term_is_there_where_a_heavy_robot_has_it(gears, sag):
     """A KR 150 with 120 kg; functions that are not there gain enough once in twenty times or less.
@@ -324,6 +326,7 @@ def test_each_term_is_there_where_a_heavy_robot_has_it(gears, sag):
     assert wrong <= binom.ppf(0.999, draws, 0.05)
 
 
+@pytest.mark.long
 def test_of_a_heavy_robot_without_masses_compliances_of_one_at_the_flange_are_found():
     """A KR 150 with 120 kg that sags; only the products count: 1 kg does as 100 do."""
     rng = np.random.default_rng(44)
@@ -466,6 +469,7 @@ def test_a_pose_left_out_errs_as_by_a_fit_without_it():
         assert expected[out] == pytest.approx(spread[out], rel=0.02, abs=1e-11)
 
 
+@pytest.mark.long
 def test_without_masses_half_of_what_they_gain_is_gained_at_least(bent, tmp_path):
     """As on the real UR10; what one mass cannot explain is in the noise that is told."""
     robot, data, check, known = bent

@@ -396,6 +396,7 @@ def test_prior_never_hurts_when_it_is_right(make_cell):
     assert with_prior < 0.5 * without
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("poses", [False, True])
 @pytest.mark.parametrize("learned", [False, True])
 @pytest.mark.parametrize("count", [12, *more(16, 20)])

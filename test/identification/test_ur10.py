@@ -146,6 +146,7 @@ def test_full_model_of_july_holds_for_months(campaigns, halved, series):
     assert result.verdict.code is Code.ACCEPT
 
 
+@pytest.mark.long
 def test_without_masses_one_at_the_flange_does_for_one_payload(campaigns, halved):
     """It is nearer to the maker's masses than to no compliance at all."""
     none, found, stated = (
@@ -172,6 +173,7 @@ def test_few_poses_give_joint_functions_too(campaigns, count, gain):
     assert full < (1.0 - gain) * plain
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1139, *more(2, 5)])  # the first can be met to 0.02 mm
 def test_two_dozen_poses_are_not_harmed(campaigns, seed):
     """Nearly one orientation and few places: what fits these poses need not hold elsewhere."""
@@ -214,6 +216,7 @@ def test_a_mirrored_tracker_frame_is_refused(halved):
     assert result.verdict.code is Code.RESIDUAL_TOO_LARGE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, *more(1, 2)])
 def test_few_poses_of_one_orientation_are_not_taken_for_outliers(halved, seed):
     """D's flange hardly turns: what is known of base and target changes much from step to step."""

@@ -110,6 +110,7 @@ class FaultCell:
         return code, end
 
 
+@pytest.mark.long
 def test_each_fault_has_its_code_within_one_cycle(graph: Any, tmp_path: Path) -> None:
     assert set(MATRIX) <= set(ALL)
     cell = FaultCell(graph, tmp_path)

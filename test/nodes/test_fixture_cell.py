@@ -122,6 +122,7 @@ def cell(graph: Any, tmp_path: Path) -> FixtureCell:
     return FixtureCell(graph, tmp_path)
 
 
+@pytest.mark.long
 def test_a_fixture_that_moved_is_told_in_one_gap_and_corrected(cell: FixtureCell) -> None:
     untaught = cell.ran("first")
     assert untaught.left == ["fixture measurement"]

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from command import robocal_json
 from hand_eye_live import STREAM, TYPES
+from long_form import more
 from rclpy.serialization import deserialize_message
 from recordings import with_events
 from robocal_msgs.msg import SessionEvent
@@ -38,7 +39,9 @@ SETTINGS = {"sensor_frame": "laser", "capture_timeout_s": 1.0}
 Z_GROWS = {"step": "towards", "tracker": "away"}
 
 
-@pytest.fixture(scope="module", params=["step", "tracker"])  # with marks; others replay elsewhere
+@pytest.fixture(
+    scope="module", params=["tracker", *more("step")]
+)  # with marks; others replay elsewhere
 def bag(request: Any, tmp_path_factory: Any) -> Path:
     """The bag made anew: only on the machine that made it are results equal to the last bit."""
     with pytest.MonkeyPatch.context() as patch:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from command import robocal_json
+from long_form import more
 from rclpy.serialization import deserialize_message
 from recordings import with_events
 from robocal_msgs.msg import BeamEvent, SessionEvent
@@ -37,7 +38,7 @@ INPUTS = {"/joint_states": JointState, "/beam_events": BeamEvent}
 CALLED = (MEASURE_TOOL, SWEEP, SOLVE_SWEEPS, ACCEPT)
 
 
-@pytest.fixture(scope="module", params=["tool_runs", "sweeps"])
+@pytest.fixture(scope="module", params=["tool_runs", *more("sweeps")])
 def bag(request: Any, tmp_path_factory: Any) -> Path:
     """A bag made anew: only on the machine that made it are results equal to the last bit."""
     with pytest.MonkeyPatch.context() as patch:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from board_driver import CHARUCO_FILE, LENS, board_file, board_set, camera_info, compressed, image
 from command import robocal_json
 from geometry_msgs.msg import PoseStamped, TransformStamped
@@ -39,6 +40,7 @@ def replayed_alike(graph: Any, folder: Path, sensor: LiveSensor, live: list, res
     assert again["T_flange_sensor"]["xyz_mm"] == [1e3 * t.x, 1e3 * t.y, 1e3 * t.z]
 
 
+@pytest.mark.long
 def test_compressed_images_of_a_marked_board_before_a_camera_that_tells_its_lens(
     graph: Any, tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
 from command import robocal_json
 from diagnostic_msgs.msg import DiagnosticArray
 from robocal_msgs.msg import SessionEvent
@@ -75,6 +76,7 @@ def test_joint_states_that_the_node_lost_are_left_out_of_the_replay(
     assert 10 < int(left_out.split()[0]) <= lost
 
 
+@pytest.mark.long
 def test_what_the_recorder_lost_is_told(graph: Any, tmp_path: Path) -> None:
     cell = Recorded(graph, tmp_path)
     assert cell.measure().success

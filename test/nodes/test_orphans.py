@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from domains import free_domain
+from long_form import more
 
 from bench.live.graph import Executable
 
@@ -84,7 +85,7 @@ def lives(pid: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("by", [signal.SIGKILL, *more(signal.SIGTERM)])
 @pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
 def test_a_node_ends_with_what_started_it(script: str, by: signal.Signals, tmp_path: Path) -> None:
     with free_domain() as domain:

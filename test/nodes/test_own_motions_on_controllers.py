@@ -247,7 +247,8 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
                 break
             own.graph.calm()
         assert stood["failed"] == "", (how, starved_s)
-        assert 0 <= more_often <= 1 or (more_often > 1 and starved_s > STARVED_S), (how, starved_s)
+        # Less often: it had arrived before the second rejection was heard.
+        assert 0 <= more_often <= 1 or starved_s > STARVED_S, (how, starved_s)
         assert late_s < starved_s, (how, stood)
 
 

@@ -202,6 +202,7 @@ def test_killed_while_the_robot_stands_nothing_moves(line: KilledBridge, is_open
     assert line.call("Run", "closed", GAP_S)[:2] == [False, Code.CONFLICT]
 
 
+@pytest.mark.long
 def test_killed_while_a_cycle_is_broken_off_the_robot_stops_or_is_at_home(
     line: KilledBridge,
 ) -> None:
@@ -253,6 +254,7 @@ def test_killed_while_the_robot_moves_it_stops_and_a_person_looks(
     assert line.status.last.run == runs
 
 
+@pytest.mark.long
 def test_killed_while_a_decision_waits_it_waits_on(line: KilledBridge) -> None:
     model_hash, state = line.cell.arm.model_hash, line.graph.state
     with CalibrationHistory.open(SERIAL, model_hash=model_hash, state_dir=state) as history:

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 from cell import Cell, outcomes
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import SessionEvent
@@ -99,6 +100,7 @@ class Recorder:
         return replayed, row
 
 
+@pytest.mark.long
 def test_a_thermal_session(graph, tmp_path, capsys):
     nominal = load_robot("kr150_r3100")
     cold, q = built(nominal), postures(nominal, 8)

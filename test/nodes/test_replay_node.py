@@ -300,6 +300,7 @@ def test_the_commands_of_the_page_run_as_typed(graph):
         assert done.returncode == 0, words
 
 
+@pytest.mark.long
 def test_what_is_damaged_in_the_bag_counts_as_lost(graph, tmp_path):
     bag = write_bag(tmp_path / "shift.mcap", 20_000, 1_000_000)
     content = bytearray(bag.read_bytes())

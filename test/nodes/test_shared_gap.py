@@ -99,6 +99,7 @@ def cells(graph: Any, tmp_path: Path) -> Iterator[list[SharedCell]]:
             cell.plc.close()
 
 
+@pytest.mark.long
 def test_the_gap_of_one_opens_and_the_other_waits_for_its_end(graph, cells):
     left, right = cells
     for cell in cells:

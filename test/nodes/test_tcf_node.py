@@ -291,6 +291,7 @@ def test_parallel_beams_alone_are_named_as_they_like() -> None:
     assert config_by(**names, **PARALLEL).beam_names == {"up": "up", "down": "down"}
 
 
+@pytest.mark.long
 def test_a_recording_that_begins_later_knows_how_the_mandrel_measures(
     graph: Any, tmp_path: Path
 ) -> None:

@@ -204,6 +204,7 @@ def stops(cell: Cell, how: str) -> None:
         graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
 
 
+@pytest.mark.long
 def test_the_robots_program_drives_what_is_announced_and_a_fault_is_refused_in_its_words(
     graph: Any, tmp_path: Path
 ) -> None:

@@ -101,6 +101,7 @@ def test_the_drift_comes_on_top_of_the_full_model(robot):
     assert model_document(robot.session.current.arm) == in_force
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("begun", "weighed"),
     [(0, True), (1, True), (2, True), (2, False)],

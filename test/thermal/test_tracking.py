@@ -364,6 +364,7 @@ def test_a_process_that_forgets_too_soon_is_refused(arm):
         DriftProcess(drift_prior(arm), approach_s=3600.0, steady_s=3600.0)
 
 
+@pytest.mark.long
 def test_a_week_of_cycles_takes_no_more_room_than_one(arm):
     """Every three minutes for a week: the state keeps its size, and stays a covariance."""
     cell, q, rng = cell_of(arm), postures(6), np.random.default_rng(7)

@@ -34,6 +34,7 @@ def shares(arm: SerialArm, truth: float, T_knock: np.ndarray) -> list[DriftShare
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("T_knock", [np.eye(4), KNOCK], ids=["still", "knocked"])
 @pytest.mark.parametrize("truth", [0.0, 1.0])
 def test_the_share_is_as_uncertain_as_it_says(arm, truth, T_knock):

@@ -135,12 +135,14 @@ def said_to_have_moved(run: KnownTool, in_force: str, move_m: float, parts: bool
     return said / TRIALS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("in_force", ["taught", "measured"])
 def test_a_tool_that_did_not_move_is_taken_for_another_in_five_percent(runs, in_force):
     room = ROOM * np.sqrt(BY_CHANCE * UNCHANGED / TRIALS)
     assert said_to_have_moved(runs[0], in_force, 0.0) == pytest.approx(BY_CHANCE, abs=room)
 
 
+@pytest.mark.long
 def test_a_move_is_found_more_often_than_with_all_noise_counted_twice(runs):
     """0.1 mm: some three sigmas of the difference."""
     now = said_to_have_moved(runs[0], "measured", 1e-4)

@@ -103,6 +103,7 @@ def test_a_cylinder_of_known_radius_gives_the_beams_reach(light):
     assert found.T_base_laser == pytest.approx(T_BASE_LASER, abs=1e-9)
 
 
+@pytest.mark.long
 def test_scatter_of_the_points_is_what_is_said():
     source, noise = TrueInput(sample_period_s=0.002), TrueNoise(3e-5, 1e-5)
     station = BeamStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), source, noise)

@@ -199,6 +199,7 @@ def test_errors_are_what_the_covariance_says():
     assert rms == pytest.approx(np.sqrt(np.mean(bound)), rel=4.0 / np.sqrt(6.0 * runs))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step_m", [1e-7, 3e-5])
 def test_edges_that_scatter_more_than_told_widen_all_that_is_told_once(step_m):
     """Three times, over the runs; the scatter is found from about 20 residuals, so that a squared
@@ -341,6 +342,7 @@ def test_a_quick_check_measures_the_deviation():
     assert found.tilt_rad == pytest.approx(np.arctan2(lateral, 0.15))
 
 
+@pytest.mark.long
 def test_a_quick_check_is_wrong_as_rarely_as_it_says():
     """At the limit a pass or a recalibration is wrong half of the time each: 5 % at most."""
     at_limit = [checked(bent(TAUGHT, [2e-4, 0.0, 0.0], [0, 0, 0]), i).answer for i in range(60)]

@@ -112,6 +112,7 @@ def scatter_over_told(many: list[StationShift]) -> np.ndarray:
     return np.asarray(np.mean(scatter**2, axis=0) / told)
 
 
+@pytest.mark.long
 def test_the_sigma_told_is_the_scatter(many):
     """Over all runs, in each of the six ways: within what so many draws of chi-square allow."""
     ratio = scatter_over_told(many)
@@ -123,6 +124,7 @@ def test_the_sigma_told_is_the_scatter(many):
     assert low < np.mean(squared) < high
 
 
+@pytest.mark.long
 def test_a_polled_input_leaves_the_sigma_honest():
     """Edges half a turn apart may fall on one phase of the input: they are not independent then.
 
