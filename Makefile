@@ -35,10 +35,10 @@ help:  ## this list
 demo: setup  ## a simulated cell in closed loop through the live nodes, report in out/report/
 	$(HURRIES) $(ROS) python bags/demo.py
 
-# Live cells of up to six processes, and motions that are judged by time, come first, two at a time;
-# then the other node tests, six at a time. They mostly wait, and what all others compute fills their
-# pauses: where the user may, node tests go before whatever else runs on the machine, elsewhere the
-# others stand back a little, but get on beside what is busy for long. What failed is shown last. A
+# Motions that are judged by time come first, one at a time; then live cells of up to seven processes,
+# two at a time; then the other node tests, six at a time. They mostly wait, and what all others compute
+# fills their pauses: where the user may, node tests go before whatever else runs on the machine, elsewhere
+# the others stand back a little, but get on beside what is busy for long. What failed is shown last. A
 # node test that failed is run once again, twice where time judges, as others on the machine may have
 # starved it, and named; never one whose examples chance picks, nor one whose output jumped
 # (test/worlds/jumps.py says when it may). So is one that Fast DDS took along as it crashed: each runs
@@ -53,13 +53,16 @@ test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
 	failed=0
 	$(GIVES_WAY) $(PYTEST) -n 2 --dist worksteal --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
 	trap 'kill $$others 2>/dev/null || true' EXIT
-	cells=$$(grep -l 'pytest\.mark\.cell' test/nodes/test_*.py)  # the others need not be read
-	$(HURRIES) $(PYTEST) --reruns 2 $(AGAIN) -n 2 --dist worksteal -m cell $$cells 2>&1 | tee out/test_cells.txt || failed=1
-	$(HURRIES) $(PYTEST) --reruns 1 $(AGAIN) -n 6 --dist worksteal -m "not cell" test/nodes 2>&1 | tee out/test_nodes.txt || failed=1
+	live() {  # what, how many at a time, how often again, which, where
+		$(HURRIES) $(PYTEST) --reruns $$3 $(AGAIN) -n $$2 --dist worksteal -m "$$4" $${@:5} 2>&1 | tee out/test_$$1.txt || failed=1
+	}
+	live timed 1 2 timed $$(grep -l 'pytest\.mark\.timed' test/nodes/test_*.py)  # others need not be read
+	live cells 2 2 cell $$(grep -l 'pytest\.mark\.cell' test/nodes/test_*.py)
+	live nodes 6 1 "not cell and not timed" test/nodes
 	wait $$others || failed=1
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt
-	[[ $$failed -eq 0 ]] || sed -n '/ test summary info/,$$p' out/test_cells.txt out/test_nodes.txt
+	[[ $$failed -eq 0 ]] || sed -n '/ test summary info/,$$p' out/test_{timed,cells,nodes}.txt
 	exit $$failed
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries

@@ -34,7 +34,7 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.cell_sim.sensors import TICK_S
 from robocal_ros.motion.driver import COPIES
 
-pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
+pytestmark = pytest.mark.timed  # judged by time: nothing else may slow it down
 
 STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])
 ACTION = f"/{NODE}/follow_joint_trajectory"
@@ -223,7 +223,7 @@ def test_a_stop_slows_down_evenly_and_never_goes_back(own):
     stop.judge(stop.late_s)
 
 
-@pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC, *more(UNTOLD)], indirect=True)
+@pytest.mark.parametrize("own", [*POSITIONS, *more(BY_TOPIC, UNTOLD)], indirect=True)
 def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
     """Done anew what a busy computer, which hid how the robot slows down, has kept from it."""
     for slow, how in (
