@@ -35,9 +35,9 @@ help:  ## this list
 demo: setup  ## a simulated cell in closed loop through the live nodes, report in out/report/
 	$(HURRIES) $(ROS) python bags/demo.py
 
-# Motions that are judged by time come first, one at a time; then live cells of up to seven processes,
-# two at a time; then the other node tests, six at a time. They mostly wait, and what all others compute
-# fills their pauses: where the user may, node tests go before whatever else runs on the machine, elsewhere
+# Live cells of up to seven processes, and motions that are judged by time, come first, one at a time, for
+# on a slow computer one needs both cores; then the other node tests, six at a time. They mostly wait, and
+# what all others compute fills their pauses: where the user may, node tests go before whatever else runs on the machine, elsewhere
 # the others stand back a little, but get on beside what is busy for long. What failed is shown last. A
 # node test that failed is run once again, twice where time judges, as others on the machine may have
 # starved it, and named; never one whose examples chance picks, nor one whose output jumped
@@ -56,13 +56,12 @@ test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
 	live() {  # what, how many at a time, how often again, which, where
 		$(HURRIES) $(PYTEST) --reruns $$3 $(AGAIN) -n $$2 --dist worksteal -m "$$4" $${@:5} 2>&1 | tee out/test_$$1.txt || failed=1
 	}
-	live timed 1 2 timed $$(grep -l 'pytest\.mark\.timed' test/nodes/test_*.py)  # others need not be read
-	live cells 2 2 cell $$(grep -l 'pytest\.mark\.cell' test/nodes/test_*.py)
-	live nodes 6 1 "not cell and not timed" test/nodes
+	live cells 1 2 cell $$(grep -l 'pytest\.mark\.cell' test/nodes/test_*.py)  # the others need not be read
+	live nodes 6 1 "not cell" test/nodes
 	wait $$others || failed=1
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt
-	[[ $$failed -eq 0 ]] || sed -n '/ test summary info/,$$p' out/test_{timed,cells,nodes}.txt
+	[[ $$failed -eq 0 ]] || sed -n '/ test summary info/,$$p' out/test_{cells,nodes}.txt
 	exit $$failed
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries

@@ -28,7 +28,7 @@ from robocal_ros.correction.trajectories import on_its_path
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.ros import conversions, endpoints
 
-pytestmark = pytest.mark.timed  # judged by time: nothing else may slow it down
+pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
 PERIOD_S = 0.02  # of the joint states
 RESTS_S = 0.5  # of a stream that begins: its first messages may be lost
 STREAM_TICKS = 2  # a busy machine must not hold the node up for two periods of the stream

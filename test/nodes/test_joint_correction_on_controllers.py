@@ -35,7 +35,7 @@ from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.ros import endpoints
 
-pytestmark = pytest.mark.timed  # judged by time: nothing else may slow it down
+pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
 
 SPEED = np.array([0.6, 0.2, -0.1, 0.3, -0.2, 0.1])  # rad/s
 # The joint that needs longest slows down as it may, the others with it.

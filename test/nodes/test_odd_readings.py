@@ -23,7 +23,7 @@ from bench.live.cell import set_fault
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import endpoints
 
-pytestmark = pytest.mark.timed
+pytestmark = pytest.mark.cell
 
 REST = np.zeros(6)
 CORRECTED = "/joint_correction_node/follow_joint_trajectory"

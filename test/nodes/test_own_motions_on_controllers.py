@@ -34,7 +34,7 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.cell_sim.sensors import TICK_S
 from robocal_ros.motion.driver import COPIES
 
-pytestmark = pytest.mark.timed  # judged by time: nothing else may slow it down
+pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
 
 STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])
 ACTION = f"/{NODE}/follow_joint_trajectory"

@@ -27,7 +27,7 @@ from trajectory_controllers import (
 
 from robocal_ros.cell_sim.trajectory_controller import SampledPath, Trajectory
 
-pytestmark = pytest.mark.timed  # in real time: what starves the controller is seen in its commands
+pytestmark = pytest.mark.cell  # in real time: what starves the controller is seen in its commands
 
 REST = np.zeros(6)
 STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])
