@@ -47,7 +47,7 @@ HURRIES := $(shell [ "$$(nice -n -10 nice 2>/dev/null)" -lt 0 ] && echo nice -n 
 GIVES_WAY := $(if $(HURRIES),,nice -n 5)
 PYTEST := $(ROS) python -m pytest -p no:cacheprovider
 AGAIN := --rerun-except '^JumpError: ' -rfER
-test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
+test: setup-dev  ## the tests, their long forms left out; TESTS="test/tool -k laser" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
 	failed=0
@@ -61,7 +61,7 @@ test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
 	wait $$others || failed=1
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt
-	[[ $$failed -eq 0 ]] || sed -n '/ test summary info/,$$p' out/test_{cells,nodes}.txt
+	[[ $$failed -eq 0 ]] || sed -sn '/ test summary info/,$$p' out/test_{cells,nodes}.txt
 	exit $$failed
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries

@@ -49,6 +49,7 @@ SHORT = Amount(300, 50, 2, 120.0, 600, 900.0)
 
 # Tests whose long form is told by itself; of which the others are, each file tells.
 LONG_FORM = {"ROBOCAL_LONG": "1"}
+AGAIN = ("--reruns", "2", "--rerun-except", "^JumpError: ")  # node tests, as the Makefile says
 LONG_FORMS = (
     ("thermal_node killed during ~/accept, kill -9", 60, "test/nodes/test_thermal_node.py"),
     ("all nodes of a correction killed together, in each order", 6,
@@ -64,7 +65,7 @@ def _other_long_forms() -> list[tuple[str, list[str]]]:
     """Each room of ``test/``, and its files that take more cases and draws in the long form."""
     told = {file for *_, file in LONG_FORMS}
     rooms: dict[str, list[str]] = {}
-    for path in sorted((ROOT / "test").glob("*/test_*.py")):
+    for path in sorted((ROOT / "test").rglob("test_*.py")):
         file = str(path.relative_to(ROOT))
         text = path.read_text()
         if file not in told and ("from long_form import" in text or "pytest.mark.long" in text):
@@ -107,7 +108,8 @@ def endurance(amount: Amount) -> Table:
     add("hostile requests to a live bridge and a live page", HOSTILE, lambda: not _hostile())
     for room, files in _other_long_forms():
         add(f"tests of {room} with all their cases and draws: files", len(files),
-            lambda files=files: not _pytest(*files, **LONG_FORM))  # fmt: skip
+            lambda room=room, files=files: not _pytest(
+                *files, *(AGAIN if room == "nodes" else ()), **LONG_FORM))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test", "--ignore=test/nodes")

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from long_form import more
 
 from bench.closed_loop import tables
 from bench.closed_loop.faults import ALARM, Trial, report_of
@@ -112,7 +111,7 @@ def reference_measured_late(plant, suite):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [51, *more(65, 73)])
+@pytest.mark.parametrize("seed", [51, 65, 73])
 def test_a_healthy_tool_is_found_where_noisy_readings_bend_its_path(seed):
     """Joint readings whose noise lets whole steps of the search overshoot for ever."""
     nominal = load_robot("kr150_r3100")
@@ -382,11 +381,11 @@ def test_a_fixture_that_moved_is_told_by_its_own_measurement(before, after, told
     assert (report.who, report.code, report.gaps) == told
 
 
-@pytest.mark.parametrize("seed", more(3))
-def test_a_fixture_that_moved_is_told_in_one_gap(seed):
+@pytest.mark.long
+def test_a_fixture_that_moved_is_told_in_one_gap():
     """Taught, a clean gap, moved, a gap: with drift and tool in all of them."""
-    trial = Trial("fixture_moved", 0.5, seed, gaps=1)
-    report = report_of(trial, *(run_shift(trial.plan, seed, suite=s) for s in (True, False)))
+    trial = Trial("fixture_moved", 0.5, seed=3, gaps=1)
+    report = report_of(trial, *(run_shift(trial.plan, seed=3, suite=s) for s in (True, False)))
     assert (report.who, report.code, report.gaps) == ("fixture", Code.ACCEPT, 1.0)
     assert report.over_s <= 0.0
     assert report.drive_faults == 0

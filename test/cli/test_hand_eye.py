@@ -139,7 +139,6 @@ class TestRecovered:
         names = {name.split("/")[0] for name in found["residual_mm"]["per_sample"]}
         assert names == set(found["target"]) == {"sphere", "step", "line"}
 
-    @pytest.mark.long
     def test_other_shots_judge_several_targets_together(self, made, checked, together, tmp_path):
         found, words = together, ["--sphere", made / "sphere", "--line", tmp_path / "line"]
         shutil.copytree(made / "line", tmp_path / "line")

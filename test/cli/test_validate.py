@@ -260,7 +260,6 @@ class TestRecordedSession:
 
 
 class TestTruth:
-    @pytest.mark.long
     def test_true_errors_of_a_drift_that_was_made(self, bags, validate) -> None:
         status, document, _, report = validate(*judged(bags))
         assert status == 0

@@ -60,7 +60,6 @@ def edges():
     return [(one.data, one.solve(), one) for one in made]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("shown_by", ["runs", "edges"])
 def test_the_field_is_recovered_within_what_is_told_of_it(shown_by, request):
     left, whole = [], []

@@ -309,7 +309,7 @@ class TestLine:
     def test_starts_that_are_given_up_lead_to_no_better_place(self, known):
         """Nor to another that is nearly as good: each start followed to its end."""
         task = line_task(LINE if known else None)
-        for seed in range(amount(1, 10)):
+        for seed in range(10):
             shots = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng([4, seed])))
             view = features(task, shots).view
             squares = []

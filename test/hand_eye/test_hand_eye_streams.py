@@ -65,7 +65,6 @@ def test_without_noise_the_offset_is_exact() -> None:
     assert pair_streams(robot, camera).offset_s == pytest.approx(0.05, abs=2e-5)
 
 
-@pytest.mark.long
 def test_outliers_and_ends_are_named() -> None:
     cell, robot, camera = recorded(0.2, "in-hand", 3)
     T = camera.T.copy()
@@ -98,7 +97,6 @@ def test_a_pause_of_the_robot_is_not_bridged() -> None:
     assert all(7.95 < times[name] < 10.05 for name in found.left_out)
 
 
-@pytest.mark.long
 def test_check_poses_of_another_time_judge() -> None:
     _, robot, camera = recorded(0.1, "in-hand", 5)
     half = len(robot.time_s) // 2

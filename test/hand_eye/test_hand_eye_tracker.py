@@ -139,7 +139,6 @@ def test_a_profile_that_alone_tells_something_is_not_left_out():
     assert states_without(problem, replace(alone, covariance=covariance), names)[0] is None
 
 
-@pytest.mark.long
 def test_classic_is_judged_by_its_distance_from_the_best():
     best, classic = clean(), clean("classic")
     points = np.concatenate([profile.points for profile in noisy().profiles])
@@ -193,7 +192,6 @@ def repeated(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(best), np.array(classic), np.array(covariance)
 
 
-@pytest.mark.long
 def test_errors_are_as_large_as_the_covariance_says():
     """Chi-square of 6 n degrees of freedom, within 4 sigma either way."""
     best, _, covariance = repeated("prp")
@@ -369,7 +367,6 @@ def smoothed() -> list:
     return found
 
 
-@pytest.mark.long
 def test_noise_that_neighbours_share_is_no_misfit_of_honest_profiles():
     for one in smoothed():
         assert not one.rejected  # 0.01 each by chance
@@ -529,7 +526,6 @@ def test_another_face_of_the_cube_is_no_match():
         solve(replace(noisy(), faces=(noisy().faces[0], points)))
 
 
-@pytest.mark.long
 def test_an_edge_square_to_the_slide_leaves_two_answers():
     made = replace(cell("prp"), edge_rad=np.radians(90.0), lean_rad=0.0)
     with pytest.raises(RankDeficientError, match="two mountings") as caught:

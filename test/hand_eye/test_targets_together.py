@@ -20,7 +20,7 @@ from hand_eye_sets import (
     stairs_target,
     step_task,
 )
-from long_form import amount, more
+from long_form import more
 from scipy.stats import binom
 
 from bench.hand_eye_cell import HandEyeCell, edge_shots, sphere_shots, step_shots
@@ -92,7 +92,6 @@ def test_of_three_the_one_that_has_moved_is_named_and_its_doubt_counts():
     assert strict.verdict.code is Code.RESIDUAL_TOO_LARGE
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("size_m", [1e-3, *more(5e-4, 2e-3)])
 def test_a_sphere_that_was_pushed_amid_its_shots_is_said_with_the_shot(size_m):
     rng = np.random.default_rng(5)
@@ -114,7 +113,7 @@ def test_a_sphere_that_was_pushed_amid_its_shots_is_said_with_the_shot(size_m):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("settings", [SETTINGS, *more(GIVEN)])
+@pytest.mark.parametrize("settings", [SETTINGS, GIVEN])
 def test_targets_that_agree_are_not_doubted(settings, monkeypatch):
     """As seldom as is said: chances below 5 % come in 5 % of the sets."""
     chances: list[float] = []
@@ -126,7 +125,7 @@ def test_targets_that_agree_are_not_doubted(settings, monkeypatch):
         return found
 
     monkeypatch.setattr(agreement, "_apart", noted)
-    count = amount(10, 400)
+    count = 400
     for seed in range(count):
         rng = np.random.default_rng([77, seed])
         found = solve_joint([sphere(rng), step(rng)], settings)

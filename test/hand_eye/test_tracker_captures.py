@@ -43,6 +43,26 @@ def knocked(mark: str) -> list[Capture]:
     return shots
 
 
+def kept_set(driver, path):
+    """Its captures in a file, and as they are read from it."""
+    data = driver.session.data
+    write_data_set(path, data.document(), data.topic, FRAME, ARM)
+    return read_data_set(path, ARM)
+
+
+def test_a_set_of_another_tracker_or_sensor_frame_is_refused(driver, tmp_path):
+    captured(driver, captures())
+    path = tmp_path / "set.mcap"
+    kept = kept_set(driver, path)
+    shots = {m.topic: m.message.header.frame_id for m in read_bag(path) if m.topic != DATA_SET}
+    assert shots == {"tracker_point": "tracker", "profile": FRAME, "joint_states": ""}
+    for name in ("tracker_frame", "sensor_frame"):
+        refused = driver.ask(events.LOAD, set=kept | {name: "another"}, path=str(path))
+        assert refused.status is Code.BAD_INPUT
+        assert f"referred to {name} 'another'" in refused.message
+    assert driver.ask(events.LOAD, set=kept, path=str(path)).done
+
+
 @pytest.mark.long
 def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
     captured(driver, captures())
@@ -56,17 +76,8 @@ def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
     assert document["joint_errors"]["size_urad"] < 30.0  # of this robot, which has no gears
     assert off @ np.linalg.solve(spread, off) < chi2.ppf(0.9999, 6)
     # In the file, and from it again: the same to the last bit.
-    data = driver.session.data
     path = tmp_path / "set.mcap"
-    write_data_set(path, data.document(), data.topic, FRAME, ARM)
-    again = read_data_set(path, ARM)
-    shots = {m.topic: m.message.header.frame_id for m in read_bag(path) if m.topic != DATA_SET}
-    assert shots == {"tracker_point": "tracker", "profile": FRAME, "joint_states": ""}
-    for name in ("tracker_frame", "sensor_frame"):
-        refused = driver.ask(events.LOAD, set=again | {name: "another"}, path=str(path))
-        assert refused.status is Code.BAD_INPUT
-        assert f"referred to {name} 'another'" in refused.message
-    assert driver.ask(events.LOAD, set=again, path=str(path)).done
+    assert driver.ask(events.LOAD, set=kept_set(driver, path), path=str(path)).done
     repeated = driver.ask(events.CALIBRATE)
     assert repeated.document == document
 

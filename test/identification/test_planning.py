@@ -40,7 +40,6 @@ def test_each_pose_is_the_best_next_one(plan):
         )
 
 
-@pytest.mark.long
 def test_planned_poses_leave_less_than_random_ones(plan):
     assert plan.predicted_rms_m[-1] < 0.9 * plan.random_rms_m
     assert len(np.unique(plan.chosen)) == 120

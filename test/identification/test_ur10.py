@@ -174,7 +174,7 @@ def test_few_poses_give_joint_functions_too(campaigns, count, gain):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1139, *more(2, 5)])  # the first can be met to 0.02 mm
+@pytest.mark.parametrize("seed", [1139, 2, 5])  # the first can be met to 0.02 mm
 def test_two_dozen_poses_are_not_harmed(campaigns, seed):
     """Nearly one orientation and few places: what fits these poses need not hold elsewhere."""
     data, arm = campaigns["D"], UR10
@@ -217,7 +217,7 @@ def test_a_mirrored_tracker_frame_is_refused(halved):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, *more(1, 2)])
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_few_poses_of_one_orientation_are_not_taken_for_outliers(halved, seed):
     """D's flange hardly turns: what is known of base and target changes much from step to step."""
     train, check = halved["D"]

@@ -241,6 +241,16 @@ def test_a_gap_that_closes_while_the_robot_is_at_home_is_no_fault(cell):
     over(cell)
 
 
+def test_a_gap_that_closes_on_the_way_home_of_a_cancelled_cycle_stops_the_robot(cell):
+    until_moving(cell, "thermal")
+    assert cell.session.cancel("by the PLC")
+    assert cell.state is MaintenanceState.BREAKING_OFF
+    cell.is_open = False
+    cell.pass_time(1.5)
+    assert cell.state is MaintenanceState.FAULT
+    assert kinds(cell)[-1] == "Stop"
+
+
 @pytest.mark.parametrize("which", ["thermal", "tool"])
 def test_a_cancelled_run_goes_home(cell, which):
     until_moving(cell, which)

@@ -34,7 +34,6 @@ def verify(sensor: LiveSensor, **request):
     return sensor.graph.call(VerifyHandEye, f"{NAME}/verify", within_s=60.0, **request)
 
 
-@pytest.mark.long
 @pytest.mark.cell
 def test_the_tracker_places_the_sensor_and_marked_points_judge_it(graph, tmp_path):
     file = tmp_path / "tracker.yaml"

@@ -116,9 +116,7 @@ def described(graph: Any) -> Described:
     return Described(graph)
 
 
-@pytest.mark.parametrize(
-    "name", ["joint_correction_node", *more(*(NODES.keys() - {"joint_correction_node"}))]
-)
+@pytest.mark.parametrize("name", SOME_NODES)
 def test_a_node_alone_waits_for_the_robot_and_goes_on_by_itself(
     graph: Any, described: Described, tmp_path: Path, name: str
 ) -> None:
@@ -216,9 +214,7 @@ def test_a_lifecycle_manager_is_told_why_it_cannot_be_configured_yet(
     assert node.state == "inactive"
 
 
-@pytest.mark.parametrize(
-    "name", ["joint_correction_node", *more(*(NODES.keys() - {"joint_correction_node"}))]
-)
+@pytest.mark.parametrize("name", SOME_NODES)
 def test_a_file_of_another_robot_is_told_in_mm_and_where_it_begins(
     graph: Any, described: Described, tmp_path: Path, name: str
 ) -> None:

@@ -309,7 +309,6 @@ def shifts(panel, days, start_s):
         panel.document(now_s, wall_s)
 
 
-@pytest.mark.long
 def test_a_page_that_is_open_for_days_holds_as_much_as_one_of_a_day():
     panel = PanelState()
     shifts(panel, 1, 1e9)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
-from long_form import amount
+from long_form import amount, more
 
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
@@ -34,8 +34,7 @@ def shares(arm: SerialArm, truth: float, T_knock: np.ndarray) -> list[DriftShare
     return found
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("T_knock", [np.eye(4), KNOCK], ids=["still", "knocked"])
+@pytest.mark.parametrize("T_knock", [KNOCK, *more(np.eye(4))], ids=["knocked", *more("still")])
 @pytest.mark.parametrize("truth", [0.0, 1.0])
 def test_the_share_is_as_uncertain_as_it_says(arm, truth, T_knock):
     """A standard normal over the trials, within three of its own standard deviations."""

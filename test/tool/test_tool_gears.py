@@ -9,7 +9,6 @@ at others is foretold of robots of that kind.
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from long_form import amount
 from scipy.stats import chi2
 
@@ -63,7 +62,6 @@ def change_of_tip(seed: int) -> tuple[float, float, float]:
     return squares[0], squares[1], erring.factor**2
 
 
-@pytest.mark.long
 def test_with_gears_it_is_off_by_as_many_sigmas_as_is_said():
     """Their part is foretold of the kind of robot, and holds both ways.
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from beam_cell import SILENT, make_cell
-from long_form import amount
+from long_form import amount, more
 
 from bench.measured_runs import (
     BETA_RAD,
@@ -199,8 +199,7 @@ def test_errors_are_what_the_covariance_says():
     assert rms == pytest.approx(np.sqrt(np.mean(bound)), rel=4.0 / np.sqrt(6.0 * runs))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("step_m", [1e-7, 3e-5])
+@pytest.mark.parametrize("step_m", [1e-7, *more(3e-5)])
 def test_edges_that_scatter_more_than_told_widen_all_that_is_told_once(step_m):
     """Three times, over the runs; the scatter is found from about 20 residuals, so that a squared
     error over its covariance is n F(n, 20), of mean n 20 / 18 for n numbers.
@@ -342,15 +341,15 @@ def test_a_quick_check_measures_the_deviation():
     assert found.tilt_rad == pytest.approx(np.arctan2(lateral, 0.15))
 
 
-@pytest.mark.long
 def test_a_quick_check_is_wrong_as_rarely_as_it_says():
     """At the limit a pass or a recalibration is wrong half of the time each: 5 % at most."""
-    at_limit = [checked(bent(TAUGHT, [2e-4, 0.0, 0.0], [0, 0, 0]), i).answer for i in range(60)]
+    runs, others = amount(20, 60), amount(3, 10)
+    at_limit = [checked(bent(TAUGHT, [2e-4, 0.0, 0.0], [0, 0, 0]), i).answer for i in range(runs)]
     for answer in ("pass", "recalibrate"):
-        assert at_limit.count(answer) <= 60 * 0.05 + 4.0 * np.sqrt(60 * 0.05 * 0.95)
-    assert {checked(TAUGHT, i).answer for i in range(10)} == {"pass"}
+        assert at_limit.count(answer) <= runs * 0.05 + 4.0 * np.sqrt(runs * 0.05 * 0.95)
+    assert {checked(TAUGHT, i).answer for i in range(others)} == {"pass"}
     moved = bent(TAUGHT, [4e-4, 0.0, 0.0], [0, 0, 0])
-    assert {checked(moved, i).answer for i in range(10)} == {"recalibrate"}
+    assert {checked(moved, i).answer for i in range(others)} == {"recalibrate"}
     assert checked(bent(TAUGHT, [2e-4, 0, 0], [0, 0, 0]), 0, 2.05e-4).answer == "cannot tell"
 
 

@@ -112,7 +112,6 @@ def scatter_over_told(many: list[StationShift]) -> np.ndarray:
     return np.asarray(np.mean(scatter**2, axis=0) / told)
 
 
-@pytest.mark.long
 def test_the_sigma_told_is_the_scatter(many):
     """Over all runs, in each of the six ways: within what so many draws of chi-square allow."""
     ratio = scatter_over_told(many)
@@ -130,7 +129,7 @@ def test_a_polled_input_leaves_the_sigma_honest():
 
     Sigma within 0.8 to 1.25 of the scatter, give or take what the runs leave of that (3 sigma).
     """
-    cell, runs = noisy_cell(), amount(30, 60)
+    cell, runs = noisy_cell(), 60
     ratio = np.sqrt(scatter_over_told([bends(cell, driven(cell, seed)) for seed in range(runs)]))
     slack = 3.0 / np.sqrt(2 * runs)
     assert np.all((ratio > 0.8 * (1.0 - slack)) & (ratio < 1.25 * (1.0 + slack))), ratio

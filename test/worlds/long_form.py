@@ -3,7 +3,7 @@
 
 A test takes as many draws, cases or rounds as can still show its promise broken; where more of the
 same are worth hours, ``ROBOCAL_LONG=1`` adds them. ``bench.soak`` sets it for each file that
-imports this one.
+imports this one, or marks a test ``long``: that one runs at length alone.
 """
 
 import os
