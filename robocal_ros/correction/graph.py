@@ -7,7 +7,7 @@ of the graph stands in `ros.graph`.
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -18,7 +18,15 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros.correction.interface import Reason
 from robocal_ros.correction.messages import joint_names
-from robocal_ros.ros.graph import KILLED, commanding, own_endpoint, publishers
+from robocal_ros.ros.graph import (
+    ACTION,
+    KILLED,
+    TRAJECTORY,
+    beside,
+    commanding,
+    own_endpoint,
+    publishers,
+)
 
 LEASE_S = 1.0  # a lease that was not renewed for so long is lost: its holder died, or hangs
 STOOD_S = 1.0  # a lost one is over when the robot has stood for so long
@@ -173,6 +181,26 @@ class JointSources:
                 self._back.append(now_s)
                 self._culprits |= again
             self._last.update(dict.fromkeys(names, number))
+
+
+def commanded_by(
+    node: Node, own: Sequence[str], clients: Mapping[str, int], *, by_action: bool
+) -> tuple[dict[str, int], dict[str, int]]:
+    """Topics and actions by which the node's controllers are commanded, as `GraphWatch` takes them.
+
+    ``own``: resolved topics that the node publishes, the one of trajectories first; ``clients``: by
+    resolved actions, how many it has. ``by_action``: whether it takes goals.
+    """
+    # A controller takes trajectories beside its action, on a topic that nobody here publishes.
+    topics = {beside(name, TRAJECTORY): 0 for name in clients}
+    topics.pop(node.resolve_topic_name(TRAJECTORY), None)  # the program's, which comes in here
+    topics |= dict.fromkeys(own, 1)
+    actions = dict(clients)
+    if not by_action:  # and beside its topic by an action, of which none is ours
+        name = beside(own[0], ACTION)
+        if name != node.resolve_topic_name(f"~/{ACTION}"):
+            actions[name] = 0
+    return topics, actions
 
 
 class GraphWatch:

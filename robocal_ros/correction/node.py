@@ -23,6 +23,7 @@ from robocal_ros.correction.graph import (
     GraphWatch,
     JointSources,
     Leases,
+    commanded_by,
 )
 from robocal_ros.correction.interface import (
     CorrectionState,
@@ -62,7 +63,7 @@ from robocal_ros.motion.stopping import WatchedStop
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, run
 from robocal_ros.ros.endpoints import Health, trigger_text
-from robocal_ros.ros.graph import ACTION, TRAJECTORY, SourceGuard, beside
+from robocal_ros.ros.graph import ACTION, TRAJECTORY, SourceGuard
 from robocal_ros.ros.parameters import ROBOT
 from robocal_ros.ros.robot import RobotNode
 
@@ -185,18 +186,12 @@ class JointCorrectionNode(RobotNode):
                     self._unheard,
                 )
             self._proxy.open(self.settings[ACTION], self._session)
-        commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
-        actions = {} if self._proxy is None else self._proxy.clients
-        # A controller takes trajectories beside its action, on a topic that nobody here publishes.
-        paths = {beside(name, TRAJECTORY): 0 for name in actions}
-        paths.pop(self.resolve_topic_name(TRAJECTORY), None)  # the program's, which comes in here
-        if not self.settings[ACTION]:  # and beside its topic by an action, of which none is ours
-            name = beside(self._outputs[TRAJECTORY].topic_name, ACTION)
-            if name != self.resolve_topic_name(f"~/{ACTION}"):
-                actions = actions | {name: 0}
+        clients = {} if self._proxy is None else self._proxy.clients
+        topics = [self._outputs[topic].topic_name for topic in (TRAJECTORY, TARGETS, COMMANDS)]
+        ways = commanded_by(self, topics, clients, by_action=bool(self.settings[ACTION]))
         sources = JointSources(self, self.resolve_topic_name(STATES), self._arm_names)
         told = (self.resolve_topic_name(LEASE), self.resolve_topic_name(CONTROLLER))
-        self._graph = GraphWatch(self, paths | commands, actions, sources, self._leases, *told)
+        self._graph = GraphWatch(self, *ways, sources, self._leases, *told)
         self._release.append(sources.close)
 
     def robot_compared(self) -> None:
