@@ -145,9 +145,10 @@ class JointCorrectionNode(RobotNode):
             topic: self.add_output(kind, f"~/{topic}", endpoints.RELIABLE)
             for topic, kind in KINDS.items()
         }
-        self.add_input(KinematicModel, MODEL, self._on_model, endpoints.LATCHED, kept=True)
-        self.add_input(ToolFrame, TOOL, self._on_tool, endpoints.LATCHED, kept=True)
-        self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED_OF_SEVERAL)
+        latched, of_several = endpoints.LATCHED, endpoints.LATCHED_OF_SEVERAL
+        self.add_input(KinematicModel, MODEL, self._on_model, latched, kept=True)
+        self.add_input(ToolFrame, TOOL, self._on_tool, latched, kept=True)
+        self.add_input(MotionLease, LEASE, self._on_lease, of_several, inactive=True)
         self.add_input(Float64, SCALING, self._on_scaling, endpoints.NEWEST)
         self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)
         states = partial(JointMessage, JointWire(readings_of=self._arm_names))
@@ -616,7 +617,8 @@ class JointCorrectionNode(RobotNode):
 
     def _on_lease(self, message: Any) -> None:
         self._leases.hear(message, time.monotonic())
-        self._judge_graph()
+        if self.is_active:
+            self._judge_graph()
 
     def _look_at_graph(self) -> None:
         for guard in self._sources.values():

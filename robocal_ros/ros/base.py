@@ -4,7 +4,7 @@
 A node names its parameters in ``SETTINGS`` and fills in four hooks:
 
 - ``configure``: read ``self.settings``, open what is needed, create inputs, outputs, services;
-- ``activate`` and ``deactivate``: start and stop acting (inactive, inputs are ignored or kept);
+- ``activate`` and ``deactivate``: start and stop acting (inputs while inactive: see `add_input`);
 - ``cleanup``: release what ``configure`` opened; also called when ``configure`` failed half-way
   and when the process ends.
 

@@ -195,6 +195,7 @@ class EndpointNode(LifecycleNode):
         timed: bool = False,
         numbered: bool = False,
         kept: bool = False,
+        inactive: bool = False,
     ) -> Subscription:
         """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
 
@@ -204,6 +205,7 @@ class EndpointNode(LifecycleNode):
         publisher's numbers, also what the queue had no room for. Neither goes with an events
         executor, which ends at a callback of two arguments (rclpy 7). ``kept``: of what comes while
         the node is inactive the last one is taken once it is active: latched, it comes only once.
+        ``inactive``: the callback is given what comes while inactive too.
         """
         count = self.inputs.setdefault(topic, InputCount())
 
@@ -216,7 +218,7 @@ class EndpointNode(LifecycleNode):
 
         def take(message: Any, *info: Any) -> None:
             count.received += 1
-            if self.is_active:
+            if self.is_active or inactive:
                 give(message, *info)
             elif kept:
                 self._kept[topic] = partial(give, message, *info)

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What reaches the joint correction node while it is inactive."""
+
+from typing import Any
+
+from joint_correction_live import NOMINAL, Line
+from robocal_msgs.msg import CorrectionStatus, MotionLease
+
+from robocal_ros.correction.graph import LEASE_S
+from robocal_ros.ros import endpoints
+
+
+def lease(*, held: bool) -> MotionLease:
+    return MotionLease(
+        robot=NOMINAL.name, serial="s1", holder="/some_name", held=held, purpose="tool"
+    )
+
+
+def test_a_lease_that_ends_while_it_is_inactive_is_over(graph: Any) -> None:
+    """Finding: it was held again at the activation, by one that would not renew it."""
+    line = Line(graph)
+    says = graph.publisher(MotionLease, "motion_lease", endpoints.LATCHED)
+    line.take(lease(held=True), says, "motion_lease")
+    line.told(state=CorrectionStatus.LEASED)
+    line.node.trigger_deactivate()
+    line.take(lease(held=False), says, "motion_lease")
+    line.statuses.clear()
+    line.node.trigger_activate()
+    assert not line.node._graph.lease
+    line.told(state=CorrectionStatus.OFF, lease="")
+    assert line.node.inputs["motion_lease"].ignored == 0
+
+
+def test_a_lease_that_began_while_it_was_inactive_holds_from_the_activation_on(graph: Any) -> None:
+    """Also one whose holder died since, until the robot stands."""
+    line = Line(graph)
+    says = graph.publisher(MotionLease, "motion_lease", endpoints.LATCHED)
+    line.node.trigger_deactivate()
+    line.take(lease(held=True), says, "motion_lease")
+    assert not line.node._session.status().held  # while it does not act
+    line.node.trigger_activate()
+    assert line.node._graph.lease == "/some_name: tool"
+    assert line.node._session.status().held
+    line.node.trigger_deactivate()
+    graph.spin_for(1.1 * LEASE_S)
+    line.node.trigger_activate()
+    assert "/some_name: tool: it has not renewed its lease" in line.node._graph.lost
+    assert line.node._session.status().held
+
+    def is_over() -> bool:
+        line.stand()
+        return not line.node._graph.lease
+
+    graph.spin_until(is_over, "the robot has stood")
+    assert not line.node._session.status().held
