@@ -6,6 +6,7 @@ import inspect
 import queue
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
@@ -75,6 +76,7 @@ def overridable() -> QoSOverridingOptions:
 
 LOG_EVERY_S = 5.0
 MOST_WAITING = 10_000  # messages of an input that are taken at once
+MOST_KEPT = 10  # messages of an input that wait for the next activation
 
 
 def trigger_text(number: int, status: Code, message: str) -> str:
@@ -160,7 +162,7 @@ class EndpointNode(LifecycleNode):
         self._release: list[Callable[[], object]] = []
         self._takers: list[tuple[str, Subscription, Callable[..., None], Callable[..., None]]] = []
         self._taking = False
-        self._kept: dict[str, Callable[[], None]] = {}  # by topic, for the next activation
+        self._kept: dict[str, deque[Callable[[], None]]] = {}  # by topic, for the next activation
 
     @property
     def state(self) -> str:
@@ -203,8 +205,10 @@ class EndpointNode(LifecycleNode):
         the callback is given the serialized message; ``timed``: also what rclpy knows of it, its
         ``source_timestamp`` (ns) among that. ``numbered``: what was lost is counted by the
         publisher's numbers, also what the queue had no room for. Neither goes with an events
-        executor, which ends at a callback of two arguments (rclpy 7). ``kept``: of what comes while
-        the node is inactive the last one is taken once it is active: latched, it comes only once.
+        executor, which ends at a callback of two arguments (rclpy 7).
+
+        ``kept``: of what comes while the node is inactive the last `MOST_KEPT` are taken once it is
+        active, in their order: latched, they come only once, and the last may be refused.
         ``inactive``: the callback is given what comes while inactive too.
         """
         count = self.inputs.setdefault(topic, InputCount())
@@ -221,7 +225,9 @@ class EndpointNode(LifecycleNode):
             if self.is_active or inactive:
                 give(message, *info)
             elif kept:
-                self._kept[topic] = partial(give, message, *info)
+                waiting = self._kept.setdefault(topic, deque(maxlen=MOST_KEPT))
+                count.ignored += len(waiting) == MOST_KEPT  # the oldest one falls out
+                waiting.append(partial(give, message, *info))
             else:
                 count.ignored += 1
 
@@ -255,8 +261,9 @@ class EndpointNode(LifecycleNode):
     def take_kept(self) -> None:
         """Take what was kept while the node was inactive."""
         kept, self._kept = self._kept, {}
-        for give in kept.values():
-            give()
+        for waiting in kept.values():
+            for give in waiting:
+                give()
 
     def take_waiting(self, *topics: str, pick: Callable[[list[Any]], Iterable[Any]] = iter) -> None:
         """Take now what the inputs have received, in place of one message of each in its turn.

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 from robocal_ros.ground.errors import Code, InputError, StaleError
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
-from robocal_ros.ros.endpoints import LOG_EVERY_S, WARN, Health, LogLimit
+from robocal_ros.ros.endpoints import LOG_EVERY_S, MOST_KEPT, WARN, Health, LogLimit
 from robocal_ros.ros.parameters import Setting
 from robocal_ros.session.inputs import MOST_REASONS
 
@@ -89,6 +89,23 @@ class Doubler(HouseNode):
         return health
 
 
+class Keeper(HouseNode):
+    """Has an input that is kept while the node is inactive, and one that is heard."""
+
+    NAME = "keeper"
+
+    def configure(self) -> None:
+        self.heard: dict[str, list[float]] = {"kept": [], "passive": []}
+        for topic, how in (("kept", {"kept": True}), ("passive", {"inactive": True})):
+            self.add_input(
+                Float64,
+                topic,
+                lambda message, topic=topic: self.heard[topic].append(message.data),
+                endpoints.RELIABLE,
+                **how,
+            )
+
+
 def set_parameter(graph: Any, **value: Any) -> Any:
     (name, typed) = value.popitem()
     kind = {float: ("double_value", 3), str: ("string_value", 4), int: ("integer_value", 2)}
@@ -147,6 +164,26 @@ def test_waits_for_commands_without_autostart_and_ignores_inputs_while_inactive(
     number.publish(Float64(data=2.0))
     graph.spin_until(lambda: doubled, "a doubled number")
     assert [message.data for message in doubled] == [4.0]
+
+
+def test_inputs_are_kept_in_their_order_or_heard_while_inactive_where_it_is_said(
+    graph: Any,
+) -> None:
+    node = graph.add(Keeper)
+    node.trigger_deactivate()
+    numbers = [float(i) for i in range(MOST_KEPT + 2)]
+    for topic in node.heard:
+        publisher, count = graph.publisher(Float64, topic), node.inputs[topic]
+        for number in numbers:
+            publisher.publish(Float64(data=number))
+        graph.spin_until(lambda count=count: count.received == len(numbers), f"{topic} is received")
+    assert node.heard == {"kept": [], "passive": numbers}
+    for _ in range(2):  # once
+        node.trigger_activate()
+        assert node.heard == {"kept": numbers[2:], "passive": numbers}
+        node.trigger_deactivate()
+    assert node.inputs["kept"].ignored == 2
+    assert node.inputs["passive"].ignored == 0
 
 
 @pytest.mark.parametrize(

@@ -3,17 +3,48 @@
 
 from typing import Any
 
-from joint_correction_live import NOMINAL, Line
+import numpy as np
+from joint_correction_live import NOMINAL, Line, drifted, model_message, tool_message
 from robocal_msgs.msg import CorrectionStatus, MotionLease
 
 from robocal_ros.correction.graph import LEASE_S
+from robocal_ros.ground import frames
 from robocal_ros.ros import endpoints
+
+BENT = NOMINAL.T_flange_tool @ frames.transform(np.eye(3), [2e-3, 0.0, 0.0])
 
 
 def lease(*, held: bool) -> MotionLease:
     return MotionLease(
         robot=NOMINAL.name, serial="s1", holder="/some_name", held=held, purpose="tool"
     )
+
+
+def test_what_comes_while_it_is_inactive_is_corrected_with_once_it_is_active(graph: Any) -> None:
+    """Model and tool are latched, and said once; of several the last one counts."""
+    line = Line(graph)
+    line.node.trigger_deactivate()
+    for revision in (3, 4):
+        line.take(model_message(drifted(), revision), line.to_model, "kinematic_model")
+        line.take(tool_message(BENT, revision), line.to_tool, "tool")
+    assert line.node._session.status().revision is None  # while it does not act
+    line.node.trigger_activate()
+    told = line.told(model_revision=4, tool_revision=4)
+    assert not told.model_waits
+    assert line.node.inputs["kinematic_model"].ignored == 0
+
+
+def test_a_good_model_and_tool_are_not_lost_behind_refused_ones(graph: Any) -> None:
+    line = Line(graph, tool_child_frame="tool")
+    line.node.trigger_deactivate()
+    for revision, size in ((5, 1.0), (4, 2.0)):
+        line.take(model_message(drifted(size), revision), line.to_model, "kinematic_model")
+    line.take(tool_message(BENT, 5), line.to_tool, "tool")
+    line.take(tool_message(BENT, 6, child_frame_id="gripper"), line.to_tool, "tool")
+    line.node.trigger_activate()
+    told = line.told(model_revision=5, tool_revision=5, model_waits=True)
+    assert told.waiting_model_revision == 4
+    assert [line.node.inputs[topic].invalid for topic in ("kinematic_model", "tool")] == [1, 1]
 
 
 def test_a_lease_that_ends_while_it_is_inactive_is_over(graph: Any) -> None:

@@ -32,7 +32,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from robocal_ros.correction.interface import Reason
 from robocal_ros.correction.node import MOST_TOPIC_POINTS_IN_MOTION, JointCorrectionNode
-from robocal_ros.ground import frames
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import OK, WARN
@@ -320,21 +319,6 @@ def test_without_a_serial_the_diagnostics_name_the_robot(graph: Any) -> None:
     assert line.report(OK, "ok").hardware_id == "kr150_r3100"
     line.take(model_message(drifted(), serial="unset"), line.to_model, "kinematic_model")
     assert line.report(OK, "ok").hardware_id == "unset"
-
-
-def test_what_comes_while_it_is_inactive_is_corrected_with_once_it_is_active(graph: Any) -> None:
-    """Model and tool are latched, and said once; of several the last one counts."""
-    line = Line(graph)
-    T = NOMINAL.T_flange_tool @ frames.transform(np.eye(3), [2e-3, 0.0, 0.0])
-    line.node.trigger_deactivate()
-    for revision in (3, 4):
-        line.take(model_message(drifted(), revision), line.to_model, "kinematic_model")
-        line.take(tool_message(T, revision), line.to_tool, "tool")
-    assert line.node._session.status().revision is None  # while it does not act
-    line.node.trigger_activate()
-    told = line.told(model_revision=4, tool_revision=4)
-    assert not told.model_waits
-    assert line.node.inputs["kinematic_model"].ignored == 0
 
 
 def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
