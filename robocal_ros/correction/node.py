@@ -206,7 +206,7 @@ class JointCorrectionNode(RobotNode):
         Also in the log: the first line of a process takes rclpy some 50 ms, which a refusal in
         motion has not.
         """
-        self._session.look(time.monotonic(), self.now_ns())
+        self._session.resume(time.monotonic(), self.now_ns())
         self._look_at_graph()
         self._tell()
         self.get_logger().info(self._session.status(time.monotonic()).in_words())

@@ -113,7 +113,9 @@ class CorrectionSession:
         self.stream, self._paths = TargetStream(output), TrajectoryCorrector(output)
         self._enabled, self._robot_fault = False, ""
         self._taught = np.full(n, np.nan)  # readings, un-corrected
-        self._goal = np.full(n, np.nan)  # taught joints that were commanded last
+        self._goal = np.full(n, np.nan)  # taught joints that were commanded last since `resume`
+        self._moved = False  # whether any were before it
+        self._looked_s = -np.inf  # steady clock of the last `look`
         # of a serialized target that is not noted yet: its stamp, ns, and when it came
         self._unsettled: tuple[int, float] | None = None
         self._held: dict[Reason, str] = {}
@@ -167,7 +169,8 @@ class CorrectionSession:
 
     def take_over(self) -> None:
         """Look again at a model or a tool that was refused for its revision or its size."""
-        for look in (lambda: self._gate.look_again(self._places()), self._gate.tools.look_again):
+        places = self._places(fresh=True)
+        for look in (lambda: self._gate.look_again(places), self._gate.tools.look_again):
             with contextlib.suppress(RefusedError):  # counted, and in the status
                 self.counted(look)
         self._want()
@@ -184,9 +187,9 @@ class CorrectionSession:
     def offer_model(self, model: OfferedModel) -> None:
         """Take over an accepted model of this robot; refused models change nothing.
 
-        How old it is, is told by the clock of the last `look`.
+        How old it is, and the robot's readings are, is told by the clocks of the last `look`.
         """
-        self.counted(lambda: self._gate.take_model(model, self._places()))
+        self.counted(lambda: self._gate.take_model(model, self._places(fresh=True)))
         self._want()
 
     def offer_tool(self, tool: OfferedTool) -> None:
@@ -196,18 +199,28 @@ class CorrectionSession:
         once while nothing was commanded yet.
         """
         self.counted(lambda: self._gate.take_tool(tool))
-        if not np.isfinite(self._goal).any():
+        if not (self._moved or np.isfinite(self._goal).any()):
             self._adopt_tool()
 
     def know_past(self, model: Past, tool: Past) -> None:
         """Tell what was in force before this session: no old message of it comes into use."""
         self._gate.know_past(model, tool)
 
+    def resume(self, now_s: float, now_ns: int) -> None:
+        """As `look`, after a time in which nothing was heard.
+
+        Others may have moved the robot: where it was sent before says nothing of it any more.
+        """
+        self._moved |= bool(np.isfinite(self._goal).any())
+        self._goal[:] = np.nan
+        self.look(now_s, now_ns)
+
     def look(self, now_s: float, now_ns: int) -> None:
         """To be called now and then: a tool waits for a robot that stands, a model grows old.
 
         ``now_ns`` is the clock that stamps the models.
         """
+        self._looked_s = now_s
         if self._gate.watch_age(now_ns):
             self._want()
         everything = np.arange(self._reference.n)
@@ -225,9 +238,13 @@ class CorrectionSession:
         tools.in_use, tools.waiting = tools.waiting or tools.in_use, None
         self._want()
 
-    def _places(self) -> Array:
-        """Taught joints (k, n) where the robot is, and where it was sent."""
-        places = np.stack([self._taught, self._goal])
+    def _places(self, *, fresh: bool = False) -> Array:
+        """Taught joints (k, n) where the robot was read last, and where it was sent.
+
+        ``fresh``: readings that are old by now tell nothing.
+        """
+        old = fresh and self.robot.blind(self._looked_s)
+        places = np.stack([self._goal] if old else [self._taught, self._goal])
         return np.asarray(places[np.isfinite(places).all(axis=1)])
 
     def _want(self) -> None:

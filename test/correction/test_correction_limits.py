@@ -150,6 +150,27 @@ def test_a_model_that_is_too_large_where_the_robot_goes_is_not_taken_over(robot:
     assert robot.session.status().waiting_revision is None
 
 
+def test_a_model_is_not_judged_where_the_robot_was_before_a_pause() -> None:
+    """Others moved it meanwhile; where it is counts once it is read there."""
+    robot = Robot()
+    arm, far = good_here_only()
+    robot.at = far
+    robot.rest()
+    robot.session.trajectory(still(far), robot.now)
+    refused(Reason.TCP_BOUND, robot.session.offer_model, offer(arm))
+    robot.now += 60.0
+    robot.session.look(robot.now, 0)
+    # it is still where it was sent, for all that is known
+    refused(Reason.TCP_BOUND, robot.session.offer_model, offer(arm))
+    robot.session.resume(robot.now, 0)
+    robot.session.offer_model(offer(arm))
+    assert robot.session.status().revision == 1
+    robot.read(far)
+    refused(Reason.TCP_BOUND, robot.session.offer_model, offer(arm, 2))
+    status = robot.session.status()
+    assert (status.revision, status.waiting_revision) == (1, 2)
+
+
 @pytest.mark.parametrize("revision", [1, 7])
 def test_a_history_that_began_again_is_taken_over_by_its_stamp(revision: int) -> None:
     robot = Robot()

@@ -64,6 +64,16 @@ def test_it_waits_for_a_robot_that_stands(robot: Robot) -> None:
     assert waiting(robot) is None
 
 
+def test_after_a_pause_it_waits_for_a_robot_that_stands(robot: Robot) -> None:
+    """It was commanded before: whether it still moves is not known."""
+    robot.now += 60.0
+    robot.session.resume(robot.now, 0)
+    robot.session.offer_tool(bent_tool())
+    assert waiting(robot) is not None
+    robot.rest()
+    assert waiting(robot) is None
+
+
 def test_a_gripper_does_not_tell_that_the_arm_stands() -> None:
     """Of its own driver; the arm's readings pause while it moves."""
     robot = Robot(joint_state_age_s=1.0)

@@ -4,6 +4,7 @@
 from typing import Any
 
 import numpy as np
+from correction_robot import good_here_only
 from joint_correction_live import NOMINAL, Line, drifted, model_message, tool_message
 from robocal_msgs.msg import CorrectionStatus, MotionLease
 
@@ -45,6 +46,22 @@ def test_a_good_model_and_tool_are_not_lost_behind_refused_ones(graph: Any) -> N
     told = line.told(model_revision=5, tool_revision=5, model_waits=True)
     assert told.waiting_model_revision == 4
     assert [line.node.inputs[topic].invalid for topic in ("kinematic_model", "tool")] == [1, 1]
+
+
+def test_a_kept_model_is_not_judged_where_the_robot_was_before(graph: Any) -> None:
+    """It stood, and was sent, where the model is too large; others moved it meanwhile."""
+    age_s = 1.0
+    line = Line(graph, taught_xyz_mm=[20.0, 0.0, 200.0], joint_state_age_s=age_s)
+    arm, far = good_here_only()
+    line.at = far
+    line.rest()
+    line.target(far)
+    line.node.trigger_deactivate()
+    graph.spin_for(1.1 * age_s)
+    model = model_message(NOMINAL.with_mdh(arm.mdh))
+    line.take(model, line.to_model, "kinematic_model")
+    line.node.trigger_activate()
+    assert not line.told(model_revision=1).model_waits
 
 
 def test_a_lease_that_ends_while_it_is_inactive_is_over(graph: Any) -> None:
