@@ -207,6 +207,7 @@ class JointCorrectionNode(RobotNode):
         motion has not.
         """
         self._session.resume(time.monotonic(), self.now_ns())
+        self.take_kept()  # or all that is told is of before
         self._look_at_graph()
         self._tell()
         self.get_logger().info(self._session.status(time.monotonic()).in_words())
@@ -246,12 +247,14 @@ class JointCorrectionNode(RobotNode):
         build = self._session.counted
         self._session.offer_model(build(lambda: offered_model(message, KinematicModel.ACCEPTED)))
         self._made_for = self._session.status().serial
-        self._tell()
+        if self.is_active:  # else `activate` tells
+            self._tell()
 
     def _on_tool(self, message: Any) -> None:
         build = self._session.counted
         self._session.offer_tool(build(lambda: offered_tool(message, ToolFrame.ACCEPTED)))
-        self._tell()
+        if self.is_active:
+            self._tell()
 
     def _on_enable(self, request: Any, response: Any) -> Any:
         """Answer whether what was asked for is so now."""

@@ -259,7 +259,7 @@ class EndpointNode(LifecycleNode):
         return subscription
 
     def take_kept(self) -> None:
-        """Take what was kept while the node was inactive."""
+        """Take what was kept while inactive; for an `activate` that tells what there is, first."""
         kept, self._kept = self._kept, {}
         for waiting in kept.values():
             for give in waiting:

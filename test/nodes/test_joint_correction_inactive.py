@@ -1,14 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What reaches the joint correction node while it is inactive."""
+"""What reaches the joint correction node while it is inactive, and what its activation tells."""
 
 from typing import Any
 
 import numpy as np
 from correction_robot import good_here_only
-from joint_correction_live import NOMINAL, Line, drifted, model_message, tool_message
-from robocal_msgs.msg import CorrectionStatus, MotionLease
+from joint_correction_live import (
+    NODE,
+    NOMINAL,
+    Line,
+    drifted,
+    model_message,
+    tool_message,
+)
+from robocal_msgs.msg import CorrectionStatus, KinematicModel, MotionLease, ToolFrame
+from test_joint_correction_history import after
 
 from robocal_ros.correction.graph import LEASE_S
+from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.ground import frames
 from robocal_ros.ros import endpoints
 
@@ -62,6 +71,31 @@ def test_a_kept_model_is_not_judged_where_the_robot_was_before(graph: Any) -> No
     line.take(model, line.to_model, "kinematic_model")
     line.node.trigger_activate()
     assert not line.told(model_revision=1).model_waits
+
+
+def test_an_activation_tells_of_what_was_kept_and_of_nothing_before_it(
+    graph: Any, capfd: Any
+) -> None:
+    """Finding: status, log and history said first that there is no model and no tool."""
+    settings = {"serial": "s1", "autostart": False, "enable_on_start": True}
+    node = graph.add(JointCorrectionNode, settings)
+    node.trigger_configure()
+    statuses = graph.collect(CorrectionStatus, f"{NODE}/status", endpoints.LATCHED)
+    for kind, topic, message in (
+        (KinematicModel, "kinematic_model", model_message(drifted(), 4)),
+        (ToolFrame, "tool", tool_message(BENT, 5)),
+    ):
+        graph.publisher(kind, topic, endpoints.LATCHED).publish(message)
+        graph.spin_until(lambda topic=topic: node.inputs[topic].received, f"{topic} is received")
+    capfd.readouterr()
+    node.trigger_activate()
+    log = capfd.readouterr().err
+    assert "model revision 4" in log
+    assert "no model and no tool" not in log
+    graph.spin_until(lambda: statuses, "a status")
+    assert (statuses[0].model_revision, statuses[0].tool_revision) == (4, 5)
+    first = after(graph, 1)[0]
+    assert (first.enabled, first.model_revision, first.tool_revision) == (True, 4, 5)
 
 
 def test_a_lease_that_ends_while_it_is_inactive_is_over(graph: Any) -> None:
