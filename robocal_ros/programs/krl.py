@@ -103,6 +103,7 @@ _END_OF_BLOCK = re.compile(r"^[ \t]*ENDSPLINE\b", re.I | re.M)
 # Of A:B frame B is given in A: a motion goes neither to A nor to B. {POS: X 1,…} names a type.
 _OPERAND = re.compile(r"\{\s*\w+[ \t]*:|:[ \t]*(\w+(?:\[\d+\])?)")
 _OPERATOR = re.compile(r"[ \t]*:")
+_LEFT = re.compile(rf"(?:\[[^\]\r\n]*\])?{_OPERATOR.pattern}")  # what is behind the name of A
 _REST = r"(?:[^\r\n{}]|\{[^{}\r\n]*\})*?"
 _PRODUCT = rf"{_REST}(?:[\w\])]|\{{[^{{}}\r\n]*\}})[ \t]*:[ \t]*[\w{{$]"
 # A CIRC to an angle (CA) ends where the controller reckons.
@@ -244,10 +245,15 @@ class _Variables:
         for found in _LITERAL.finditer(clean):
             self._set.setdefault(self._meant(found[1], found.start(1)), []).append(found.end() - 1)
         for found in _USED.finditer(clean):
-            for name in filter(None, found.groups()):
+            for i, name in enumerate(found.groups(), start=1):
+                if name is None:
+                    continue
                 whole = name if _NUMBERED.search(name) else _array(name)
-                goals = self._goals.setdefault(self._meant(whole, found.start()), [])
-                goals.append(found.start())
+                one = self._meant(whole, found.start())
+                self._goals.setdefault(one, []).append(found.start())
+                # a motion to A:B goes to no place A
+                if not _LEFT.match(clean, found.end(i)):
+                    self._positions.add(one)
         # Of A:B frame B is given in A; what a relative motion names is a way.
         for found in chain(_OPERAND.finditer(clean), _RELATIVE.finditer(clean)):
             for name in filter(None, found.groups()):
@@ -260,7 +266,7 @@ class _Variables:
     def is_position(self, name: str, at: int) -> bool:
         """Whether it was declared as a position, or a motion goes to it."""
         both = self._meant(name, at), self._meant(_array(name), at)
-        return any(one in self._positions or one in self._goals for one in both)
+        return any(one in self._positions for one in both)
 
     def motions(self, name: str, at: int) -> list[int]:
         """Where motions go to the value that is set at a place: up to the next one, else all."""

@@ -121,6 +121,16 @@ def test_a_point_is_in_the_base_of_its_motions(lines, frames):
     assert reckoned == (["the program reckons with it in line 12"] if "DEF B()" in lines else [])
 
 
+@pytest.mark.parametrize("place", [POINT, "P[1]", "P[I+1], P[I+2]"])
+def test_a_frame_that_places_are_given_in_is_no_place(place):
+    """Corrected as if the tool went to it, the work object's origin would move."""
+    lines = f"LIN WOBJ:{place}\nLIN FIX[1] : {place}\nCIRC VIA, FIX[I+1]:{place}\nLIN SEAM\n"
+    frames = "".join(f"DECL FRAME {name}={POINT}\n" for name in ("WOBJ", "SEAM", "VIA"))
+    data = f"{frames}DECL FRAME FIX[2]\nFIX[1]={POINT}\nFIX[2]={POINT}\n"
+    points = KrlDialect(f"DEF A()\n{lines}END\n", "a.src").read(data).points
+    assert [point.name for point in points] == ["SEAM", "VIA"]
+
+
 def test_what_an_inline_form_sets_for_its_motion():
     """KSS 8: of a circle's auxiliary point, which has no FDAT of its own."""
     sets = "$TOOL = STOOL2(FP3), $BASE = SBASE(FP3.BASE_NO), $IPO_MODE = SIPO_MODE(FP3.IPO_FRAME)"
