@@ -6,6 +6,7 @@ where they differ it is unknown, by a name that no frame has. A routine that is 
 sets in some way: unknown behind its call, but for what is in force there anyway.
 """
 
+import math
 import re
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
@@ -203,3 +204,61 @@ class Flow:
 
     def _unknown(self, kind: str, at: int) -> str:
         return f"{kind}{OF_LINE}{self._line(at)} on"
+
+
+@dataclass(eq=False)
+class TextRegion:
+    """A part of a text that is gone through from its begin: a routine, a loop's body, a branch.
+
+    ``around``: the one that it is part of; None: it is a routine. ``jumps``: whether one has any.
+    """
+
+    begin: int
+    around: "TextRegion | None" = None
+    loop: bool = False
+    end: float = math.inf
+    jumps: bool = False
+
+    @property
+    def routine(self) -> "TextRegion":
+        """The routine that it is part of, or is."""
+        return self if self.around is None else self.around.routine
+
+
+class TextRegions:
+    """Of which regions a place of a text is part; at ``begins`` other texts begin."""
+
+    def __init__(self, steps: Sequence[FlowStep], begins: Sequence[int] = ()) -> None:
+        self._calls = sorted(step.at for step in steps if step.does == "call")
+        self._places, self._found = [0], [TextRegion(0)]
+        places = [(step.at, step.does) for step in steps]
+        for at, does in sorted([*places, *((begin, "alone") for begin in begins)]):
+            one = self._found[-1]
+            match does:
+                case "alone":
+                    one = TextRegion(at)
+                case "begin" | "loop":
+                    one = TextRegion(at, one, does == "loop")
+                case "branch" | "else" if one.around:
+                    one = TextRegion(at, one.around)
+                case "end" if one.around:
+                    one.end, one = at, one.around
+                case "jump":
+                    one.routine.jumps = True
+            self._places.append(at)
+            self._found.append(one)
+
+    def at(self, place: int) -> TextRegion:
+        """The innermost that a place is part of."""
+        return self._found[bisect_right(self._places, place) - 1]
+
+    def around(self, place: int) -> list[TextRegion]:
+        """All that a place is part of, from the innermost to its routine."""
+        found = [self.at(place)]
+        while found[-1].around:
+            found.append(found[-1].around)
+        return found
+
+    def calls(self, first: float, last: float) -> bool:
+        """Whether a routine is called between two places."""
+        return bisect_right(self._calls, last) > bisect_right(self._calls, first)

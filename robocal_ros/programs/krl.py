@@ -12,16 +12,24 @@ Sources are in docs/programs.md.
 
 import math
 import re
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import chain
 
 import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import DEGREE, pose_of
-from robocal_ros.programs.flow import Flow, FlowStep, flow_steps, labels_of
+from robocal_ros.programs.flow import (
+    Flow,
+    FlowStep,
+    TextRegion,
+    TextRegions,
+    flow_steps,
+    labels_of,
+)
 from robocal_ros.programs.points import (
     EDGE,
     OF_LINE,
@@ -33,7 +41,7 @@ from robocal_ros.programs.points import (
     ProgramPoint,
     Stance,
     arguments,
-    line_of,
+    lines_of,
     masked,
     require_numbers,
 )
@@ -62,7 +70,7 @@ _ASSIGNED = re.compile(
 _MOVED = re.compile(
     rf"\b(?P<move>{MOVES}(?P<relative>_REL)?)\b[^\r\n{{}}]*(?:\{{[^{{}}]*\}}\s*,\s*)?$", re.I
 )
-_LITERAL = re.compile(r"(\$?[A-Za-z_]\w*(?:\[[^\]\r\n]*\])?)\s*=\s*\{")
+_LITERAL = re.compile(r"(\$?[A-Za-z_]\w*(?:\[[^\]\r\n]*\])?)\s*=\s*\{([^{}]*)\}")
 _NAME = r"(\w+(?:\[\w+\])?)"
 _USED = re.compile(rf"\b{MOVES}(?:\s+{_NAME}|\s*\{{[^{{}}]*\}})(?:\s*,\s*{_NAME})?", re.I)
 _INDEXED = r"(\w+(?:\[\d+\])?)(?:\[[^\]\r\n]*\])?"
@@ -138,23 +146,25 @@ class KrlDialect(Dialect):
     def read(self, text: str) -> Program:
         """Points of POS and E6POS, of AXIS and E6AXIS, and of motions; frames by number."""
         clean = masked(f"{text}\n{self.other}", ";")
-        line = self._lines(text)
+        own_line, line = lines_of(text), self._lines(text)
         frames = {"TOOL_DATA[0]": np.eye(4), "BASE_DATA[0]": np.eye(4)}
         frames |= {name: np.eye(4) for name in ROBROOT}
         numbered, unsettled = _numbered_frames(line, clean)
         frames |= numbered
         inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
-        flow, within = _flow(line, clean, frames, inline), _withs(line, clean, frames, inline)
-        variables = _Variables(clean, len(text))
+        labels, plain = labels_of(_without(clean), _LABEL)
+        steps = labels + flow_steps(plain, _BLOCK, _CALL)
+        in_force = _InForce(line, clean, _flow(line, plain, steps, frames, inline), frames, inline)
+        variables = _Variables(clean, len(text), steps, in_force)
         points: list[ProgramPoint] = []
         for braces in _BRACES.finditer(clean, 0, len(text)):
-            found = _point(text, clean, braces, variables)
+            found = _point(own_line(braces.start()), clean, braces, variables)
             if found is None:
                 continue
             point, name, at = *found, braces.start()
             goals = variables.motions(name, at) if name else [at]
             if not point.joints:
-                point = _framed(point, goals, inline, flow, within)
+                point = _framed(point, goals, inline, in_force)
                 tool = unsettled.get(point.tool or "", point.tool)
                 frame = unsettled.get(point.frame or "", point.frame)
                 point = replace(point, tool=tool, frame=frame)
@@ -164,7 +174,7 @@ class KrlDialect(Dialect):
             points.append(replace(point, order=min(goals, default=at)))
         made = [*_COMPUTED.finditer(_without(clean)), *_CHANGED.finditer(clean)]
         computed = tuple(
-            (line_of(text, found.start()), text[found.start() : found.end()].strip())
+            (own_line(found.start()), text[found.start() : found.end()].strip())
             for found in made
             if found.start() < len(text)
         )
@@ -173,11 +183,12 @@ class KrlDialect(Dialect):
 
     def _lines(self, text: str) -> Callable[[int], str]:
         """Of a place in both files, the line in words."""
+        own, others = lines_of(text), lines_of(self.other)
 
         def line(at: int) -> str:
             if at <= len(text):
-                return str(line_of(text, at))
-            return f"{line_of(self.other, at - len(text) - 1)} of {self.other_name}"
+                return str(own(at))
+            return f"{others(at - len(text) - 1)} of {self.other_name}"
 
         return line
 
@@ -223,16 +234,34 @@ class _Variables:
     """What a module's position variables are for, each where it is named.
 
     A name means what its routine declares, else what the module does. ``boundary``: where the
-    second of two files begins.
+    second of two files begins. In ``_goals`` NAME[] stands for all elements by their numbers.
     """
 
-    def __init__(self, clean: str, boundary: int) -> None:
-        routines = {found.start() for found in _BLOCK.finditer(clean) if found["alone"]}
+    def __init__(
+        self, clean: str, boundary: int, steps: Sequence[FlowStep], in_force: "_InForce"
+    ) -> None:
+        self._in_force = in_force
+        routines = {step.at for step in steps if step.does == "alone"}
         self._begins = sorted({boundary, *routines})
+        self._regions = TextRegions(steps, [boundary])
         self._local: set[_Variable] = set()
         self._goals: dict[_Variable, list[int]] = {}  # by which motions go to it
         self._set: dict[_Variable, list[int]] = {}
+        self._whole: dict[tuple[_Variable, TextRegion], list[int]] = {}  # set in all components
+        self._setters: dict[_Variable, set[TextRegion]] = {}  # routines, by variable or array
+        self._reached: dict[_Variable, tuple[list[int], dict[int, list[int]]]] = {}
         self._reckoned: dict[_Variable, int] = {}
+        self._declare(clean, routines)
+        for found in _LITERAL.finditer(clean):
+            self._add_value(found, routines)
+        for found in _USED.finditer(clean):
+            self._add_motion(clean, found)
+        # Of A:B frame B is given in A; what a relative motion names is a way.
+        for found in chain(_OPERAND.finditer(clean), _RELATIVE.finditer(clean)):
+            for name in filter(None, found.groups()):
+                self._reckoned.setdefault(self._meant(name, found.start()), found.start())
+
+    def _declare(self, clean: str, routines: set[int]) -> None:
         declared: list[tuple[str, str, int]] = []
         for found in _DECLARED.finditer(clean):
             names = re.findall(r"\w+", re.sub(r"\[[^\]]*\]", "", found[2]))
@@ -242,22 +271,28 @@ class _Variables:
             if scope and self._begins[scope - 1] in routines:
                 self._local.add((scope, name.upper()))
         self._positions = {self._meant(name, at) for kind, name, at in declared if kind in TARGETS}
-        for found in _LITERAL.finditer(clean):
-            self._set.setdefault(self._meant(found[1], found.start(1)), []).append(found.end() - 1)
-        for found in _USED.finditer(clean):
-            for i, name in enumerate(found.groups(), start=1):
-                if name is None:
-                    continue
-                whole = name if _NUMBERED.search(name) else _array(name)
-                one = self._meant(whole, found.start())
-                self._goals.setdefault(one, []).append(found.start())
-                # a motion to A:B goes to no place A
-                if not _LEFT.match(clean, found.end(i)):
-                    self._positions.add(one)
-        # Of A:B frame B is given in A; what a relative motion names is a way.
-        for found in chain(_OPERAND.finditer(clean), _RELATIVE.finditer(clean)):
-            for name in filter(None, found.groups()):
-                self._reckoned.setdefault(self._meant(name, found.start()), found.start())
+
+    def _add_value(self, found: re.Match[str], routines: set[int]) -> None:
+        one, at = self._meant(found[1], found.start()), found.start(2) - 1
+        region = self._regions.at(at)
+        self._set.setdefault(one, []).append(at)
+        if region.routine.begin in routines:
+            self._setters.setdefault(_array_of(one), set()).add(region.routine)
+        parts = _parts(found[2], 0).keys()
+        if not _runs(one) and (parts >= {*POSE} or parts >= {*AXES}):
+            self._whole.setdefault((one, region), []).append(at)
+
+    def _add_motion(self, clean: str, found: re.Match[str]) -> None:
+        for i, name in enumerate(found.groups(), start=1):
+            if name is None:
+                continue
+            array, at = _array(name), found.start()
+            for each in (name, f"{array}[]") if _NUMBERED.search(name) else (array,):
+                self._goals.setdefault(self._meant(each, at), []).append(at)
+            # a motion to A:B goes to no place A
+            if not _LEFT.match(clean, found.end(i)):
+                whole = name if _NUMBERED.search(name) else array
+                self._positions.add(self._meant(whole, at))
 
     def _meant(self, name: str, at: int) -> _Variable:
         scope = bisect_right(self._begins, at)
@@ -265,25 +300,75 @@ class _Variables:
 
     def is_position(self, name: str, at: int) -> bool:
         """Whether it was declared as a position, or a motion goes to it."""
-        both = self._meant(name, at), self._meant(_array(name), at)
-        return any(one in self._positions for one in both)
+        one = self._meant(name, at)
+        return one in self._positions or _array_of(one) in self._positions
 
     def motions(self, name: str, at: int) -> list[int]:
-        """Where motions go to the value that is set at a place: up to the next one, else all."""
-        one, array = self._meant(name, at), self._meant(_array(name), at)
-        goals = [place for key in dict.fromkeys((one, array)) for place in self._goals.get(key, ())]
-        until = min((place for place in self._set.get(one, ()) if place > at), default=math.inf)
-        return [place for place in goals if at < place < until] or goals
+        """Where motions go to the value that is set at a place; where none does, to any value.
+
+        Of many that have the same in force the first may stand for all.
+        """
+        one = self._meant(name, at)
+        if one not in self._reached:
+            self._reached[one] = self._reach(one)
+        goals, reached = self._reached[one]
+        return reached.get(at) or goals
+
+    def _reach(self, one: _Variable) -> tuple[list[int], dict[int, list[int]]]:
+        """The motions to a variable; by the place of a value those that may go to it."""
+        array = _array_of(one)
+        keys = (array, (array[0], f"{array[1]}[]")) if _runs(one) else (one, array)
+        goals = sorted({at for key in keys for at in self._goals.get(key, ())})
+        values = self._set.get(one, [])
+        reached: dict[int, list[int]] = {at: [] for at in values}
+        anywhere = []
+        for goal in goals:
+            first, last = self._window(one, goal)
+            if first < 0:
+                anywhere.append(goal)
+                continue
+            for at in values[bisect_left(values, first) : bisect_right(values, last)]:
+                reached[at].append(goal)
+        common = self._in_force.different(anywhere)
+        return self._in_force.different(goals), {
+            at: sorted([*common, *own]) for at, own in reached.items()
+        }
+
+    def _window(self, one: _Variable, goal: int) -> tuple[float, float]:
+        """Between which places a variable is set to what a motion may go to.
+
+        All ways to the motion lead past the first. Behind the motion are those to which a loop
+        leads back.
+        """
+        regions, first = self._regions.around(goal), -math.inf
+        for region in regions:
+            values = self._whole.get((one, region), [])
+            if i := bisect_left(values, goal):
+                first = max(first, values[i - 1])
+        last = max([goal, *(each.end for each in regions if each.loop and each.begin > first)])
+        others = self._setters.get(_array_of(one), set()) - {regions[-1]}
+        if first < 0 or regions[-1].jumps or (others and self._regions.calls(first, last)):
+            return -math.inf, math.inf
+        return first, last
 
     def reckoned_at(self, name: str, at: int) -> int | None:
         """Where the program reckons with it; None: it does not."""
-        found = self._reckoned.get(self._meant(_array(name), at))
-        return self._reckoned.get(self._meant(name, at), found)
+        one = self._meant(name, at)
+        return self._reckoned.get(one, self._reckoned.get(_array_of(one)))
 
 
 def _array(name: str) -> str:
     """An element's array; a variable itself."""
     return name.partition("[")[0]
+
+
+def _array_of(one: _Variable) -> _Variable:
+    return one[0], _array(one[1])
+
+
+def _runs(one: _Variable) -> bool:
+    """Whether it is an element whose number runs."""
+    return "[" in one[1] and not _NUMBERED.search(one[1])
 
 
 def _parts(body: str, at: int) -> dict[str, Field]:
@@ -322,7 +407,7 @@ def _numbered_frames(
 
 
 def _point(
-    text: str, clean: str, braces: re.Match[str], variables: _Variables
+    line: int, clean: str, braces: re.Match[str], variables: _Variables
 ) -> tuple[ProgramPoint, str] | None:
     """The point in braces, and the variable that it is set to, empty for a motion's.
 
@@ -335,7 +420,6 @@ def _point(
     if before.rstrip().endswith(":") or _OPERATOR.match(clean, braces.end()):
         return None
     assigned, moved = _ASSIGNED.search(before), _MOVED.search(before)
-    line = line_of(text, braces.start())
     if assigned:
         title = name = assigned["name"]
         target = (assigned["type"] or "").upper() in TARGETS
@@ -392,8 +476,8 @@ class _With:
     """What a WITH sets, as of `_given`, for its motion or block."""
 
     at: int
-    names: dict[str, str | None]
     until: int
+    names: dict[str, str]
 
 
 def _without(clean: str) -> str:
@@ -402,31 +486,18 @@ def _without(clean: str) -> str:
 
 
 def _flow(
-    line: Callable[[int], str], clean: str, frames: dict[str, Array], inline: dict[str, str]
+    line: Callable[[int], str],
+    plain: str,
+    steps: Sequence[FlowStep],
+    frames: dict[str, Array],
+    inline: dict[str, str],
 ) -> Flow:
-    """What is set but by a WITH."""
-    labels, clean = labels_of(_without(clean), _LABEL)
-    steps = labels + flow_steps(clean, _BLOCK, _CALL)
-    for found in _SET.finditer(clean):
-        names = _given(line(found.start()), found, frames, inline)
-        steps.append(FlowStep(found.start(), "set", names))
-    return Flow(line, steps, frames)
-
-
-def _withs(
-    line: Callable[[int], str], clean: str, frames: dict[str, Array], inline: dict[str, str]
-) -> list[_With]:
-    """In the order of the text: an inner one goes before the one around it."""
+    """What is set but by a WITH; ``plain``: the text without these, and without labels."""
     sets = []
-    for found in _WITH.finditer(clean):
-        end = _END_OF_BLOCK.search(clean, found.end()) if found["block"] else None
-        until = end.start() if end else found.end()
-        for part in arguments(clean, found.end("motion"), found.end()):
-            if given := _SET.match(part.text):
-                names = _given(line(part.start), given, frames, inline)
-                if None not in names.values():
-                    sets.append(_With(found.start(), names, until))
-    return sets
+    for found in _SET.finditer(plain):
+        names = _given(line(found.start()), found, frames, inline)
+        sets.append(FlowStep(found.start(), "set", names))
+    return Flow(line, [*steps, *sets], frames)
 
 
 def _given(
@@ -484,38 +555,70 @@ def _of_fdat(body: str, here: str) -> dict[str, str | None]:
     return names
 
 
+class _InForce:
+    """Which tool, base and IPO mode motions have."""
+
+    def __init__(
+        self,
+        line: Callable[[int], str],
+        clean: str,
+        flow: Flow,
+        frames: dict[str, Array],
+        inline: dict[str, str],
+    ) -> None:
+        self._flow = flow
+        self._blocks: list[_With] = []
+        self._motions: list[_With] = []
+        for found in _WITH.finditer(clean):
+            names: dict[str, str | None] = {}
+            for part in arguments(clean, found.end("motion"), found.end()):
+                if given := _SET.match(part.text):
+                    names |= _given(line(part.start), given, frames, inline)
+            known = {kind: name for kind, name in names.items() if name is not None}
+            end = _END_OF_BLOCK.search(clean, found.end()) if found["block"] else None
+            of = self._blocks if found["block"] else self._motions
+            of.append(_With(found.start(), end.start() if end else found.end(), known))
+        self.at = cache(self._at)
+
+    def _at(self, place: int) -> tuple[str | None, ...]:
+        """By kind, for the motion at a place."""
+        names = dict(self._flow.at(place))
+        for sets in (self._blocks, self._motions):  # that of the motion goes before its block's
+            i = bisect_right(sets, place, key=lambda one: one.at)
+            if i and place < sets[i - 1].until:
+                names |= sets[i - 1].names
+        return tuple(map(names.get, KINDS))
+
+    def different(self, goals: Sequence[int]) -> list[int]:
+        """Of motions that have the same the first."""
+        first: dict[tuple[str | None, ...], int] = {}
+        for goal in goals:
+            first.setdefault(self.at(goal), goal)
+        return [*first.values()]
+
+    def of(self, goals: Sequence[int]) -> dict[str, str | None] | None:
+        """What motions have in common, empty where there are none; None: they differ."""
+        first, *others = dict.fromkeys(map(self.at, goals)) or [()]
+        if all(all(map(self._flow.same, first, other)) for other in others):
+            return dict(zip(KINDS, first, strict=False))
+        return None
+
+
 def _framed(
-    point: ProgramPoint,
-    goals: Sequence[int],
-    inline: dict[str, str],
-    flow: Flow,
-    within: list[_With],
+    point: ProgramPoint, goals: Sequence[int], inline: dict[str, str], in_force: _InForce
 ) -> ProgramPoint:
     """The point with the names of its frames, and what about them forbids a correction.
 
     ``goals``: where motions go to it.
     """
     body = inline.get("F" + point.name.upper().removeprefix("X"))
-    if body is not None:
-        names = _of_fdat(body, f"{OF_LINE}{point.line}")
-    else:
-        each = [_in_force(at, flow, within) for at in goals]
-        names = each[0] if each else {}
-        if any(not flow.same(names.get(kind), one.get(kind)) for one in each for kind in KINDS):
-            words = "motions with different tools or bases go to it"
-            return replace(point, problem=point.problem or words)
+    names = in_force.of(goals) if body is None else _of_fdat(body, f"{OF_LINE}{point.line}")
+    if names is None:
+        words = "motions with different tools or bases go to it"
+        return replace(point, problem=point.problem or words)
     if mode := names.get("$IPO_MODE"):
         words = "the robot carries the part to a tool that stands"
         if mode != "#TCP":
             words = f"whether the robot carries the part is not known ({mode})"
         return replace(point, problem=point.problem or words)
     return replace(point, tool=names.get("$TOOL"), frame=names.get("$BASE"))
-
-
-def _in_force(at: int, flow: Flow, within: list[_With]) -> dict[str, str | None]:
-    """What is in force for the motion at a place."""
-    names = dict(flow.at(at))
-    for one in within:
-        if one.at <= at < one.until:
-            names |= one.names
-    return names

@@ -8,7 +8,8 @@ ends. A point that cannot be corrected keeps its place in the list, with the rea
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -194,6 +195,12 @@ def base_moved(point: ProgramPoint, ways: Mapping[int, Array]) -> Array:
 def line_of(text: str, at: int) -> int:
     """The line, from 1, of a character."""
     return text.count("\n", 0, at) + 1
+
+
+def lines_of(text: str) -> Callable[[int], int]:
+    """`line_of` for many characters of a long text."""
+    ends = [found.start() for found in re.finditer("\n", text)]
+    return lambda at: bisect_left(ends, at) + 1
 
 
 def masked(text: str, comment: str, quote: str = '"') -> str:

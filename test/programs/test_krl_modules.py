@@ -121,6 +121,75 @@ def test_a_point_is_in_the_base_of_its_motions(lines, frames):
     assert reckoned == (["the program reckons with it in line 12"] if "DEF B()" in lines else [])
 
 
+B1, B2, LIN, SET = "$BASE=BASE_DATA[1]", "$BASE=BASE_DATA[2]", "LIN P", f"P={POINT}"
+DIFFERENT = "motions with different tools or bases go to it"
+
+
+@pytest.mark.parametrize(
+    ("lines", "found"),
+    [  # by value its base, or that motions differ
+        ([B1, SET, LIN, B2, SET, LIN], ["BASE_DATA[1]", "BASE_DATA[2]"]),
+        # the next round begins with the value that the one before has set
+        (["LOOP", B1, LIN, B2, SET, LIN, "ENDLOOP"], [DIFFERENT]),
+        (["LOOP", B1, SET, LIN, B2, SET, LIN, "ENDLOOP"], ["BASE_DATA[1]", "BASE_DATA[2]"]),
+        ([SET, "WHILE A", B1, LIN, B2, SET, LIN, "ENDWHILE"], ["BASE_DATA[1]", DIFFERENT]),
+        ([B1, SET, "REPEAT", LIN, "UNTIL A", B2, SET, LIN], ["BASE_DATA[1]", "BASE_DATA[2]"]),
+        # and so does a routine that is called again, or that others call
+        ([B1, LIN, B2, SET, LIN], [DIFFERENT]),
+        ([SET, B1, LIN, "B()", SET, LIN, "END", "DEF B()", B2, LIN], [DIFFERENT, DIFFERENT]),
+        (
+            [SET, B1, LIN, "END", "DEF B()", SET, B2, LIN],
+            ["BASE_DATA[1]", "BASE_DATA[2]"],
+        ),
+        (  # what is called between sets it anew
+            [SET, "B()", B1, LIN, "END", "DEF B()", SET, B2, LIN],
+            ["BASE_DATA[1]", DIFFERENT],
+        ),
+        (
+            [B1, SET, "B()", LIN, B2, SET, "B()", LIN, "END", "DEF B()"],
+            ["BASE_DATA[1]", "BASE_DATA[2]"],
+        ),
+        # a value that only one branch sets does not end the one before
+        ([B1, SET, LIN, "IF A THEN", SET, "ENDIF", B2, LIN], [DIFFERENT, "BASE_DATA[2]"]),
+        (
+            ["SWITCH A", "CASE 1", B1, SET, LIN, "CASE 2", B2, SET, LIN, "ENDSWITCH"],
+            ["BASE_DATA[1]", "BASE_DATA[2]"],
+        ),
+        ([B1, SET, "GOTO ON", B2, SET, "ON:", B1, LIN, B2, LIN], [DIFFERENT, DIFFERENT]),
+        # nor does one that leaves components as they are
+        (
+            [B1, SET, LIN, "P={Z 9}", B2, LIN],
+            [DIFFERENT, "leaves components as they are at run time: X, Y, A, B, C"],
+        ),
+    ],
+)
+def test_a_value_has_the_base_of_the_motions_that_it_reaches(lines, found):
+    """P is the module's, declared in its data list: it outlives the routines."""
+    text = "\n".join(["DEF A()", *lines, "END", ""])
+    points = KrlDialect("DEFDAT A\nDECL POS P\nENDDAT\n", "a.dat").read(text).points
+    assert [point.problem or point.frame for point in points] == found
+
+
+def test_a_value_of_the_data_list_reaches_what_no_other_one_goes_before():
+    data = f"DEFDAT A\nDECL POS P={POINT}\nENDDAT\n"
+    for body, found in (
+        ([B1, LIN, "PLACE()", SET, "END", "DEF PLACE()", B2, LIN], DIFFERENT),
+        ([B1, LIN, B2, SET, LIN], "BASE_DATA[1]"),
+    ):
+        text = "\n".join(["DEF A()", *body, "END", ""])
+        (point,) = KrlDialect(text, "a.src").read(data).points
+        assert (point.problem or point.frame) == found
+
+
+def test_a_value_of_an_element_reaches_motions_to_it_by_a_number_that_runs():
+    lines = [B1, f"P[1]={POINT}", "LIN P[1]", B2, f"P[1]={POINT}", "LIN P[I]", f"P[I]={POINT}"]
+    text = "\n".join(["DEF A()", "DECL POS P[2]", *lines, B1, "LIN P[2]", "END", ""])
+    points = dialect_of(".src").read(text).points
+    assert [point.problem or point.frame for point in points] == [
+        "BASE_DATA[1]", "BASE_DATA[2]", DIFFERENT,
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("place", [POINT, "P[1]", "P[I+1], P[I+2]"])
 def test_a_frame_that_places_are_given_in_is_no_place(place):
     """Corrected as if the tool went to it, the work object's origin would move."""
