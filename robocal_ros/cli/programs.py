@@ -70,6 +70,7 @@ _MODEL = (
     "robot file of the robot as identified, or what 'robocal history show --json' prints of a "
     "calibration"
 )
+CONFIG = "$config.dat"
 SAME_M, SAME_RAD = 1e-6, 2e-5  # of one frame in two files that round it, to 0.001 mm and deg
 _EXAMPLE = """example:
   robocal correct-program weld.dat --robot kr150_r3100 --model identified.yaml \\
@@ -279,7 +280,8 @@ def _add_other_files(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="KUKA, ABB: further file of tools and bases ($config.dat, a module)",
+        help="KUKA, ABB: further file of tools and bases ($config.dat, of which FDAT are read too, "
+        "a module)",
     )
     parser.add_argument(
         "--frame",
@@ -321,8 +323,9 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
     if isinstance(dialect, KrlDialect):
         module = args.module or other_file(args.program)
         warnings += _module_note(args.program, module)
-        if module is not None:
-            dialect = KrlDialect(_program_text(module, dialect), module.name)
+        config = "".join(_program_text(p, dialect) for p in args.frames if p.name.lower() == CONFIG)
+        other = ("", "") if module is None else (_program_text(module, dialect), module.name)
+        dialect = KrlDialect(*other, config)
     elif args.module is not None:
         raise InputError(f"--module: a program of {dialect.maker} is one file; leave it out")
     given = _given_frames(args, dialect, program)

@@ -51,6 +51,7 @@ AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
 EXTERNAL = ("E1", "E2", "E3", "E4", "E5", "E6")
 ROBROOT = ("$NULLFRAME", "$WORLD", "$ROBROOT")
 KINDS = ("$TOOL", "$BASE", "$IPO_MODE")
+OF_FDAT = {"TOOL_NO": "$TOOL", "BASE_NO": "$BASE", "IPO_FRAME": "$IPO_MODE"}
 TARGETS = ("E6POS", "POS", "E6AXIS", "AXIS")
 BEHIND, ABOVE, FLIPPED = 1, 2, 4  # bits of S; the third says again what T says of A5
 ABSOLUTE = 16
@@ -88,8 +89,8 @@ _SET = re.compile(
     r"\$(?P<kind>TOOL|BASE)(?P<part>\.\w+)?\s*=(?!=)\s*"
     r"(?P<value>(?:\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?)[^\r\n;]*)"
     r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)"
-    r"|^[ \t]*FDAT_ACT(?:\.\w+)?\s*=(?!=)\s*(?P<fdat>\{[^{}]*\}|[^\r\n]*)"
-    r"|\$IPO_MODE\s*=(?!=)\s*(?P<mode>#?\w+(?:\(\s*\w+\.\w+\s*\))?)",
+    r"|^[ \t]*FDAT_ACT(?:\.(?P<entry>\w+))?\s*=(?!=)\s*(?P<fdat>\{[^{}]*\}|[^\r\n]*)"
+    r"|\$IPO_MODE\s*=(?!=)\s*(?P<mode>#?\w+(?:\(\s*\w+(?:\.\w+)?\s*\))?)",
     re.I | re.M,
 )
 # As inline forms of KSS 8 write it: what the FDAT of a point says.
@@ -133,11 +134,13 @@ class KrlDialect(Dialect):
     """KUKA: nine digits as the controller writes them; S and T follow the joints.
 
     ``other``: text of the module's other file, the .src of a .dat or the .dat of a .src, which is
-    read with each text; ``other_name``: the file's. Without it empty.
+    read with each text; ``other_name``: the file's. Without it empty. ``config``: text of
+    $config.dat, whose FDAT serve all programs.
     """
 
     other: str = ""
     other_name: str = ""
+    config: str = ""
     maker = "kuka"
     suffixes = (".src", ".dat", ".sub")
     decimals = Decimals(length=4, turn=6, joint=6)
@@ -151,7 +154,8 @@ class KrlDialect(Dialect):
         frames |= {name: np.eye(4) for name in ROBROOT}
         numbered, unsettled = _numbered_frames(line, clean)
         frames |= numbered
-        inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
+        texts = masked(self.config, ";"), clean
+        inline = {one[1].upper(): one[2] for each in texts for one in _FDAT.finditer(each)}
         labels, plain = labels_of(_without(clean), _LABEL)
         steps = labels + flow_steps(plain, _BLOCK, _CALL)
         in_force = _InForce(line, clean, _flow(line, plain, steps, frames, inline), frames, inline)
@@ -512,9 +516,12 @@ def _given(
     here = f"{OF_LINE}{line}"  # of what is not read here: unknown
     if mode := found["mode"]:
         told = _of_inline(mode, inline, here)
-        return {"$IPO_MODE": told["$IPO_MODE"] if told else _carried(mode)}
+        return {"$IPO_MODE": told["$IPO_MODE"] if told else _carried(mode, here)}
     if found["fdat"] is not None:  # for the BAS(#FRAMES) behind it
         word = found["fdat"].strip()
+        if entry := found["entry"]:
+            kind = OF_FDAT.get(entry.upper())
+            return {kind: _of_fdat(f"{entry} {word}", here)[kind]} if kind else {}
         body = word[1:-1] if word.startswith("{") else inline.get(word.upper(), "")
         return _of_fdat(body, here)
     if found["bas"]:
@@ -533,9 +540,10 @@ def _given(
     return {kind: name}
 
 
-def _carried(mode: str) -> str:
-    """An IPO mode where the robot carries the part; else empty."""
-    return mode.strip().upper() if mode.strip().upper() == "#TCP" else ""
+def _carried(mode: str, here: str) -> str:
+    """#TCP where the robot carries the part, empty where it does not; else a name that says so."""
+    known = {"#TCP": "#TCP", "#BASE": "", "#NONE": ""}
+    return known.get(mode.strip().upper(), f"$IPO_MODE{here}")
 
 
 def _of_inline(value: str, inline: dict[str, str], here: str) -> dict[str, str | None]:
@@ -546,12 +554,17 @@ def _of_inline(value: str, inline: dict[str, str], here: str) -> dict[str, str |
 
 
 def _of_fdat(body: str, here: str) -> dict[str, str | None]:
-    """What the components of an FDAT set; ``here``: behind the name of what they leave out."""
+    """What the components of an FDAT set; ``here``: behind the name of what they leave out.
+
+    Without any it is not known.
+    """
     parts = {name: part.text.strip().upper() for name, part in _parts(body, 0).items()}
-    names: dict[str, str | None] = {"$IPO_MODE": _carried(parts.get("IPO_FRAME", ""))}
+    mode = parts.get("IPO_FRAME", "#NONE" if parts else "")
+    names: dict[str, str | None] = {"$IPO_MODE": _carried(mode, here)}
     for kind in ("TOOL", "BASE"):
-        number = parts.get(f"{kind}_NO")
-        names[f"${kind}"] = f"${kind}{here}" if number is None else f"{kind}_DATA[{number}]"
+        number = parts.get(f"{kind}_NO", "")
+        known = re.fullmatch(r"-?\d+", number)
+        names[f"${kind}"] = f"{kind}_DATA[{number}]" if known else f"${kind}{here}"
     return names
 
 

@@ -100,6 +100,18 @@ def test_a_tool_that_is_reckoned_is_not_that_of_the_same_line_elsewhere(folder: 
     assert "unknown tool $TOOL of line 2" in point["reason"]
 
 
+def test_the_frames_of_home_are_those_of_the_robots_own_data_list(folder: Path, capsys):
+    (place,) = re.findall(r"E6POS XP1=(\{[^}]*\})", (folder / "weld.dat").read_text("latin-1"))
+    lines = f"FDAT_ACT=FHOME\nBAS(#FRAMES)\nLIN {place}\n"
+    (folder / "part.src").write_text(f"DEF part()\n{lines}END\n")
+    home = "DECL FDAT FHOME={TOOL_NO 3,BASE_NO 5,IPO_FRAME #BASE}\n"
+    (folder / "$config.dat").write_text(KUKA_FRAMES + home)
+    _, alone = command(capsys, "part.src", *MODEL)
+    assert "$IPO_MODE of line 2" in alone["points"][0]["reason"]
+    _, known = command(capsys, "part.src", *MODEL, *KNOWN)
+    assert known["points"][0]["state"] == "corrected"
+
+
 def test_a_data_list_is_read_with_the_program_beside_it(folder: Path, capsys):
     """A way that only the program's LIN_REL tells from a place; the name is in other letters."""
     words = ("weld.dat", *MODEL, *KNOWN)

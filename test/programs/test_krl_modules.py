@@ -213,6 +213,17 @@ def test_what_an_inline_form_sets_for_its_motion():
     assert [point.name for point in points if "stands" in point.problem] == ["XVIA", "XP3"]
 
 
+def test_frames_of_all_programs_are_those_of_the_robots_own_data_list():
+    """As FHOME of $config.dat; what the module itself has of that name goes before it."""
+    config = "DEFDAT  $CONFIG\nDECL FDAT FHOME={TOOL_NO 3,BASE_NO 4,IPO_FRAME #BASE}\n"
+    config += "DECL FDAT FP3={TOOL_NO 9,BASE_NO 9,IPO_FRAME #TCP}\nENDDAT\n"
+    text = f"DEF A()\nFDAT_ACT=FHOME\nLIN {POINT}\nFDAT_ACT=FP3\nLIN {POINT}\nEND\n"
+    points = KrlDialect(DATA, "a.dat", config).read(text).points
+    assert [(point.tool, point.frame, point.problem) for point in points] == [
+        ("TOOL_DATA[3]", "BASE_DATA[4]", ""), ("TOOL_DATA[7]", "BASE_DATA[8]", ""),
+    ]  # fmt: skip
+
+
 def test_a_point_by_joints_needs_no_frames():
     """The flange stands right, whichever tool is in force."""
     axes = "{A1 0,A2 -90,A3 90,A4 0,A5 30,A6 0}"

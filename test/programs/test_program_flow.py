@@ -7,6 +7,8 @@ from robocal_ros.programs.correcting import dialect_of
 
 POINT = "{X 1,Y 2,Z 3,A 0,B 0,C 0}"
 B1, B2, LIN = "$BASE=BASE_DATA[1]", "$BASE=BASE_DATA[2]", f"LIN {POINT}"
+FDAT = "FDAT_ACT={TOOL_NO 1,BASE_NO 2,IPO_FRAME #BASE}"
+NOT_KNOWN = "whether the robot carries the part is not known ($IPO_MODE of line {})"
 A, B = "set_tcp(p[0,0,.1,0,0,0])", "set_tcp(p[0,0,.2,0,0,0])"
 MOVEL = "movel(p[.4,-.3,.2,0,3.1,0])"
 
@@ -46,8 +48,40 @@ def test_frames_that_are_set_by_fdat_act():
     assert frames[:3] == [
         (None, None), ("TOOL_DATA[6]", "BASE_DATA[2]"), ("TOOL_DATA[3]", "BASE_DATA[4]"),
     ]  # fmt: skip
-    assert frames[3] == ("$TOOL of line 13", "$BASE of line 13")  # of another file
+    assert points[3].problem == NOT_KNOWN.format(13)  # of another file
     assert ["stands" in point.problem for point in points[4:]] == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("lines", "problem"),
+    [  # of the last line's motion
+        (["$IPO_MODE=MODE", LIN], 3),
+        (["$IPO_MODE=MODE", "$IPO_MODE=#NONE", LIN], None),
+        (["FDAT_ACT=FP9", LIN], 3),
+        (["FDAT_ACT=FP9", B1, "BAS(#TOOL,1)", LIN], 3),
+        (["FDAT_ACT={TOOL_NO 1,BASE_NO 1,IPO_FRAME MODE}", LIN], 3),
+        (["FDAT_ACT={TOOL_NO 1,BASE_NO 1}", LIN], None),
+        (["FDAT_ACT.IPO_FRAME=MODE", LIN], 3),
+        (["FDAT_ACT.TOOL_NO=N", LIN], None),
+        (["FDAT_ACT=FP9", "FDAT_ACT.IPO_FRAME=#BASE", LIN], None),
+        ([f"S{LIN} WITH $TOOL=STOOL2(FP9), $IPO_MODE=SIPO_MODE(FP9.IPO_FRAME)"], 3),
+        ([f"S{LIN} WITH $IPO_MODE=SIPO_MODE(FP1)"], None),
+        ([f"S{LIN} WITH $IPO_MODE=SIPO_MODE(FP9)", LIN], None),
+    ],
+)
+def test_a_tool_that_may_stand_is_told(lines, problem):
+    """As by an FDAT of another file; the point of one would be corrected the wrong way round."""
+    declared = "DECL FDAT FP1={TOOL_NO 3,BASE_NO 4,IPO_FRAME #BASE}"
+    points = dialect_of(".src").read("\n".join(["DEF A()", declared, *lines, "END", ""])).points
+    assert points[-1].problem == (NOT_KNOWN.format(problem) if problem else "")
+
+
+def test_components_of_fdat_act_are_set_one_by_one():
+    lines = ["BAS(#BASE,1)", "FDAT_ACT.TOOL_NO=3", LIN, "FDAT_ACT.BASE_NO=N", LIN]
+    points = dialect_of(".src").read("\n".join([*lines, ""])).points
+    assert [(point.tool, point.frame) for point in points] == [
+        ("TOOL_DATA[3]", "BASE_DATA[1]"), ("TOOL_DATA[3]", "$BASE of line 4"),
+    ]  # fmt: skip
 
 
 def test_a_robot_that_carries_the_part_as_its_ipo_mode_says():
@@ -112,7 +146,7 @@ def test_a_routine_with_the_usual_begin_carries_no_part():
         ([B1, "again :", LIN, "WAIT SEC 1", B2, "goto AGAIN"], ["$BASE of line 2 on"]),
         ([B1, "AGAIN:", LIN, "GOTO AGAIN"], ["BASE_DATA[1]"]),
         (
-            [B1, "IF K==1 THEN", "GOTO _L$1", "ENDIF", "FDAT_ACT=FP1", "_L$1: WAIT SEC 1", LIN],
+            [B1, "IF K==1 THEN", "GOTO _L$1", "ENDIF", FDAT, "_L$1: WAIT SEC 1", LIN],
             ["$BASE of line 6 on"],
         ),
         (["DEF A()", B1, "L1:", LIN, "END", "DEF B()", B2, "GOTO L1", "END"], ["BASE_DATA[1]"]),
