@@ -321,7 +321,7 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
     program = _program_text(args.program, dialect)
     module = None
     if isinstance(dialect, KrlDialect):
-        module = args.module or other_file(args.program)
+        module = _module_of(args.program, args.module)
         warnings += _module_note(args.program, module)
         config = "".join(_program_text(p, dialect) for p in args.frames if p.name.lower() == CONFIG)
         other = ("", "") if module is None else (_program_text(module, dialect), module.name)
@@ -371,9 +371,17 @@ def _program_verdict(done: CorrectedProgram, args: argparse.Namespace) -> Verdic
     return Verdict(Code.LIMIT_EXCEEDED, words)
 
 
-def other_file(program: Path) -> Path | None:
-    """The file beside a KUKA program that makes a module with it; upper and lower case alike."""
+def _module_of(program: Path, given: Path | None) -> Path | None:
+    """The other file of a KUKA program's module: as given, else beside it, in any letters.
+
+    Raises `InputError` for one that can be none.
+    """
     wanted = (".src", ".sub") if program.suffix.lower() == ".dat" else (".dat",)
+    if given is not None:
+        if given.suffix.lower() in wanted:
+            return given
+        words = f"--module: to {program.name} belongs a file with the ending {' or '.join(wanted)}"
+        raise InputError(f"{words}; give one of tools and bases by --frames", file=str(given))
     try:
         beside = {
             path.suffix.lower(): path

@@ -133,6 +133,16 @@ def test_a_data_list_is_read_with_the_program_beside_it(folder: Path, capsys):
     assert [point["state"] for point in given["points"]] == list(states.values())
     status, document = command(capsys, *words, "--module", "none.src")
     assert (status, document["error"]["file"]) == (2, "none.src")
+    (folder / "weld.src").write_text("DEF WELD()\nEND\n")
+    for program, wrong, ending in (
+        ("weld.dat", "$config.dat", ".src or .sub"),
+        ("weld.dat", "weld.dat", ".src or .sub"),
+        ("weld.src", "weld.src", ".dat"),
+    ):
+        status, document = command(capsys, program, *MODEL, "--module", wrong)
+        assert (status, document["error"]["file"]) == (2, wrong)
+        words = f"to {program} belongs a file with the ending {ending}; give one of tools and bases"
+        assert words in document["error"]["message"]
     (folder / "main.as").write_text(".PROGRAM main()\n.END\n")
     status, document = command(capsys, "main.as", *MODEL, "--module", "weld.dat")
     assert status == 2
