@@ -367,7 +367,7 @@ def _program_verdict(done: CorrectedProgram, args: argparse.Namespace) -> Verdic
     if not left:
         return Verdict(Code.ACCEPT, f"all of {len(own)} points are as they should be{told}")
     hint = "" if args.partial else "; --partial writes the others all the same"
-    words = f"{left} of {len(own)} points are left as they were{told}{hint}"
+    words = f"{left} of {len(own)} points are left as they were{hint}{told}"
     return Verdict(Code.LIMIT_EXCEEDED, words)
 
 
@@ -450,7 +450,8 @@ def _show_corrected(console: "Console", document: Document) -> None:
         shift = (f"{point['shift_mm']:.4f}", f"{point['shift_deg']:.4f}")
         rows.append([point["name"], str(point["line"]), *shift, left, point["reason"]])
     count = document["count"]
-    title = ", ".join(f"{count[state]} {state.replace('_', ' ')}" for state in STATES)
+    shown = [state for state in STATES if count[state] or state != "of_another_group"]
+    title = ", ".join(f"{count[state]} {state.replace('_', ' ')}" for state in shown)
     head = ("point", "line", "moved mm", "deg", "left mm", "why not")
     if document["module"] is not None:
         print_words(console, f"Read with {document['module']}.")

@@ -276,18 +276,21 @@ def report(done: CorrectedProgram) -> "ProgramReportDocument":
             "corrected": states.count("corrected"),
             "unchanged": states.count("unchanged"),
             "not_corrected": states.count("not_corrected"),
+            "of_another_group": states.count("of_another_group"),
         },
         "warnings": list(done.program.notes),
         "computed": [{"line": line, "text": text} for line, text in done.program.computed],
     }
 
 
-State = Literal["corrected", "unchanged", "not_corrected"]
+State = Literal["corrected", "unchanged", "not_corrected", "of_another_group"]
 STATES: tuple[State, ...] = get_args(State)
 
 
 def _point_document(one: CorrectedPoint) -> "ProgramPointDocument":
     state: State = "not_corrected" if one.reason else "corrected" if one.changes else "unchanged"
+    if one.point.of_another:
+        state = "of_another_group"
     return {
         "name": one.point.name,
         "line": one.point.line,

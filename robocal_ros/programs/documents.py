@@ -44,6 +44,9 @@ class PointCountsDocument(TypedDict):
     corrected: Count
     unchanged: Count
     not_corrected: Count
+    of_another_group: Annotated[
+        Count, "FANUC: of another motion group alone; nothing of these is to be corrected."
+    ]
 
 
 class ComputedPointDocument(TypedDict):

@@ -71,7 +71,9 @@ def test_a_program_is_corrected_into_another_file(folder: Path, capsys):
     status, document = command(capsys, *words)
     assert status == 0
     assert document["verdict"]["code"] == "ACCEPT"
-    assert document["count"] == {"corrected": 4, "unchanged": 0, "not_corrected": 0}
+    assert document["count"] == {
+        "corrected": 4, "unchanged": 0, "not_corrected": 0, "of_another_group": 0,
+    }  # fmt: skip
     assert max(point["left_mm"] for point in document["points"]) < 1e-3
     after = (folder / "new.dat").read_bytes()
     assert before == (folder / "weld.dat").read_bytes() != after
@@ -149,12 +151,14 @@ def test_a_data_list_is_read_with_the_program_beside_it(folder: Path, capsys):
     assert "is one file" in document["error"]["message"]
 
 
+def fanuc_point(number: int, q: np.ndarray) -> str:
+    joints = ",\n".join(f"\tJ{i} = {x:.3f} deg" for i, x in enumerate(np.degrees(q), start=1))
+    return f"P[{number}]{{\n   GP1:\n\tUF : 0, UT : 0,\n{joints}\n}};\n"
+
+
 def test_points_of_another_group_are_told_by_name_and_hold_nothing_up(folder: Path, capsys):
     """As of a positioner that turns alone: no model of this robot says where it should be."""
-    joints = ",\n".join(
-        f"\tJ{i} = {x:.3f} deg" for i, x in enumerate(np.degrees(postures(1, 6)[0]), start=1)
-    )
-    own = f"P[1]{{\n   GP1:\n\tUF : 0, UT : 0,\n{joints}\n}};\n"
+    own = fanuc_point(1, postures(1, 6)[0])
     others = 'P[2:"turn"]{\n   GP2:\n\tUF : 0, UT : 1,\n\tJ1 = 90.000 deg\n};\n'
     (folder / "part.ls").write_text(f"/PROG  PART\n/MN\n/POS\n{own}{others}/END\n")
     _, document = command(capsys, "part.ls", *MODEL, "--output", "new.ls")
@@ -162,8 +166,21 @@ def test_points_of_another_group_are_told_by_name_and_hold_nothing_up(folder: Pa
     assert document["verdict"]["reason"] == (
         "all of 1 points are as they should be; of another group alone, not corrected: P[2] turn"
     )
+    assert document["count"] == {
+        "corrected": 1, "unchanged": 0, "not_corrected": 0, "of_another_group": 1,
+    }  # fmt: skip
     assert document["points"][1]["reason"] == "is of group 2 alone: group 1 alone is corrected"
+    assert document["points"][1]["state"] == "of_another_group"
     assert others in (folder / "new.ls").read_text()
+    left = fanuc_point(3, SINGULAR)
+    (folder / "part.ls").write_text(f"/PROG  PART\n/MN\n/POS\n{own}{others}{left}/END\n")
+    _, document = command(capsys, "part.ls", *MODEL, "--largest-mm", "0.001")
+    assert document["verdict"]["reason"] == (
+        "2 of 2 points are left as they were; --partial writes the others all the same; "
+        "of another group alone, not corrected: P[2] turn"
+    )
+    assert main(["correct-program", "part.ls", *MODEL, "--robot", "kr150_r3100"]) == 0
+    assert "not corrected, 1 of another group" in " ".join(capsys.readouterr().out.split())
     (folder / "turn.ls").write_text(f"/PROG  TURN\n/MN\n/POS\n{others}/END\n")
     status, document = command(capsys, "turn.ls", *MODEL)
     assert status == 2
@@ -346,6 +363,7 @@ def test_people_get_a_table(folder: Path, capsys):
     assert main(["correct-program", "weld.dat", *MODEL, "--robot", "kr150_r3100"]) == 0
     said = capsys.readouterr().out
     assert "3 not corrected" in said
+    assert "another group" not in said
     assert "unknown frame BASE_DATA[5]" in said
     assert "--partial writes the others" in said
 
