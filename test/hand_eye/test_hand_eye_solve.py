@@ -304,12 +304,11 @@ class TestLine:
         sigma = expected_error_m(found.covariance, np.array([[0.0, 0.0, 0.2]]) - found.pivot)
         assert np.linalg.norm(across) < 4.0 * sigma + 1e-4  # and what the robot repeats to
 
-    @pytest.mark.long
     @pytest.mark.parametrize("known", [True, False])
     def test_starts_that_are_given_up_lead_to_no_better_place(self, known):
         """Nor to another that is nearly as good: each start followed to its end."""
         task = line_task(LINE if known else None)
-        for seed in range(10):
+        for seed in range(amount(1, 10)):
             shots = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng([4, seed])))
             view = features(task, shots).view
             squares = []

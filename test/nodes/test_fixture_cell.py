@@ -105,10 +105,9 @@ class FixtureCell(BeatingPlc):
         answer = self.graph.call(Trigger, f"/fixture_node/{name}_trigger")
         return answer.success, answer.message
 
-    def page(self, decided: int = 0) -> PanelState:
-        """What panel_node makes of what was said last, with all up to a result decided."""
+    def page(self) -> PanelState:
+        """What panel_node makes of what was said last."""
         panel = PanelState()
-        panel.newest = decided
         said = {STATUS: self.status, ACCURACY: self.states[-1], FIXTURE: self.verdicts[-1]}
         for stamp in (1, 2):
             for source, message in said.items():
@@ -151,7 +150,9 @@ def test_a_fixture_that_moved_is_told_in_one_gap_and_corrected(cell: FixtureCell
     )
     assert decided.success, decided.message
     cell.graph.spin_until(lambda: len(cell.frames) == 2, "the new frame")
-    assert "ACCEPT/fixture" not in [task.key for task in cell.page(number).tasks(0.0)]
+    cell.graph.spin_until(  # once the status says so too
+        lambda: "ACCEPT/fixture" not in [task.key for task in cell.page().tasks(0.0)], "decided"
+    )
     before, after = (matrix_of(one.pose.pose) for one in cell.frames)
     change = SimpleNamespace(change=after @ frames.invert(before))
     world = MeasuredFixture(SEED)
