@@ -36,9 +36,10 @@ demo: setup  ## a simulated cell in closed loop through the live nodes, report i
 	$(HURRIES) $(ROS) python bags/demo.py
 
 # Live cells of up to seven processes, and motions that are judged by time, come first, one at a time, for
-# on a slow computer one needs both cores; then the other node tests, six at a time. They mostly wait, and
-# what all others compute fills their pauses: where the user may, node tests go before whatever else runs on the machine, elsewhere
-# the others stand back a little, but get on beside what is busy for long. What failed is shown last. A
+# on a slow computer one needs both cores; then the other node tests, six at a time. They mostly wait,
+# and what all others compute fills their pauses: where the user may, node tests go before whatever else
+# runs on the machine, elsewhere the others stand back a little, but get on beside what is busy for
+# long. What failed is shown last. A
 # node test that failed is run once again, twice where time judges, as others on the machine may have
 # starved it, and named; never one whose examples chance picks, nor one whose output jumped
 # (test/worlds/jumps.py says when it may). So is one that Fast DDS took along as it crashed: each runs
