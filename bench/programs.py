@@ -20,8 +20,9 @@ from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import inverse
-from robocal_ros.programs.correcting import CorrectionModels, ProgramCorrection, dialect_of
+from robocal_ros.programs.correcting import ProgramCorrection, dialect_of
 from robocal_ros.programs.frame_shift import best_shift, shifted_joints
+from robocal_ros.programs.postures import CorrectionModels
 from robocal_ros.thermal.accuracy import EarlierShift, learn_process
 from robocal_ros.thermal.screening import share_within
 

@@ -39,7 +39,6 @@ from robocal_ros.programs.conventions import COUNT, base_text, tool_text
 from robocal_ros.programs.correcting import (
     STATES,
     CorrectedProgram,
-    CorrectionModels,
     ProgramCorrection,
     dialect_of,
     report,
@@ -48,6 +47,7 @@ from robocal_ros.programs.fanuc import FanucDialect
 from robocal_ros.programs.frame_shift import LEVER_M, PARTS, FrameShift, best_shift, given_shift
 from robocal_ros.programs.krl import KrlDialect
 from robocal_ros.programs.points import OF_LINE, Dialect, frame_given
+from robocal_ros.programs.postures import CorrectionModels
 from robocal_ros.thermal.proposing import (
     ShiftedWork,
     keep_shift,

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 SINGULAR_PIVOT = 1e-13
 # Keeps J^T J of a redundant arm regular; the shift then is the shortest one.
 REDUNDANT = 1e-9
+# On the diagonal of J^T J: per square of the residual, and always.
+DAMPED, LEAST_DAMPED = 1e-3, 1e-14
 
 
 @lean
@@ -199,6 +201,44 @@ def _solved(L: Array, x: Array, n: int) -> None:
         for k in range(i + 1, n):
             value -= L[k, i] * x[k]
         x[i] = value
+
+
+@kernel
+def reach_batch(
+    goals: Array,
+    links: Array,
+    root: Array,
+    steps: int,
+    longest: float,
+    close: float,
+    q: Array,
+    left: Array,
+) -> None:
+    """Move joints (m, n), each from where it is, towards its goal (m, 4, 4).
+
+    Steps that no joint makes longer than ``longest``, damped as far as the goal is away (Levenberg
+    and Marquardt), until it is nearer than ``close``; ``left`` (m,): by how much it is missed.
+    """
+    n = links.shape[0]
+    frames, turns, T = np.empty((n, 2, 3)), np.empty(turns_size(n)), np.empty((4, 4))
+    J, L, e, step = np.empty((n, 6)), np.empty((n, n)), np.empty(6), np.empty(n)
+    for k in range(goals.shape[0]):
+        for taken in range(steps + 1):
+            walk(q[k], links, root, turns, frames, T)
+            left[k] = residual(goals[k], T, e)
+            if left[k] < close or taken == steps:
+                break
+            columns(links, frames, T, J)
+            _square(J, L, n)
+            square = length(e, 0) ** 2 + length(e, 3) ** 2
+            for i in range(n):
+                L[i, i] += DAMPED * min(square, 1.0) + LEAST_DAMPED
+            factor_in_place(L)
+            _multiply(J, e, step, n)
+            solve_in_place(L, step)
+            share = min(1.0, longest / max(largest_of(step), 1e-300))
+            for i in range(n):
+                q[k, i] += share * step[i]
 
 
 @lean

@@ -22,7 +22,6 @@ import numpy as np
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.ground.frames import Array
-from robocal_ros.kinematics import SerialArm
 from robocal_ros.programs.conventions import numbers_of, pose_of
 from robocal_ros.programs.fanuc import FanucDialect
 from robocal_ros.programs.kawasaki import KawasakiDialect
@@ -37,7 +36,13 @@ from robocal_ros.programs.points import (
     spliced,
     written,
 )
-from robocal_ros.programs.postures import chosen_posture, is_singular, reach, stance_of
+from robocal_ros.programs.postures import (
+    CorrectionModels,
+    chosen_posture,
+    is_singular,
+    reach,
+    stance_of,
+)
 from robocal_ros.programs.rapid import RapidDialect
 from robocal_ros.programs.urscript import UrScriptDialect
 
@@ -53,20 +58,6 @@ DIALECTS: tuple[Dialect, ...] = (
 )
 # Below this nothing is to be corrected: no format has as many digits.
 LEAST_M, LEAST_RAD = 1e-7, 1e-7
-
-
-@dataclass(frozen=True, eq=False)
-class CorrectionModels:
-    """The arms of equation (1), of one robot, and how far a correction may go.
-
-    ``largest_m``: of the flange; ``largest_rad``: of a joint (prismatic: `largest_m`).
-    """
-
-    nominal: SerialArm
-    actual: SerialArm
-    reference: SerialArm
-    largest_m: float = 5e-3
-    largest_rad: float = float(np.radians(1.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,7 @@ import numpy as np
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.ground.frames import Array, Mask
-from robocal_ros.programs.correcting import CorrectionModels
-from robocal_ros.programs.postures import reach
+from robocal_ros.programs.postures import CorrectionModels, reach
 
 LEVER_M = 0.1
 HELD = 0.05 / 10.0

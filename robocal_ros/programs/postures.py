@@ -29,33 +29,31 @@ SLACK = np.radians(0.05)
 WITHOUT_LIMIT = 2.0 * np.pi
 
 
-def reach(
-    arm: SerialArm, T_base_flange: Array, start: Array, steps: int = STEPS
-) -> tuple[Array, Mask]:
+@dataclass(frozen=True, eq=False)
+class CorrectionModels:
+    """The arms of one robot by which programs and frames are corrected, and how far.
+
+    ``largest_m``: of the flange; ``largest_rad``: of a joint (prismatic: `largest_m`).
+    """
+
+    nominal: SerialArm
+    actual: SerialArm
+    reference: SerialArm
+    largest_m: float = 5e-3
+    largest_rad: float = float(np.radians(1.0))
+
+
+def reach(arm: SerialArm, T_base_flange: Array, start: Array) -> tuple[Array, Mask]:
     """Joints (m, n) by Newton steps from ``start`` (m, n), and where they reach poses (m, 4, 4)."""
-    q, goals = np.array(start, dtype=np.float64), np.asarray(T_base_flange)
-    left = np.arange(len(q))
-    e = _twist(arm, q, goals)
-    for _ in range(steps):
-        far = np.max(np.abs(e), axis=1) >= 0.1 * REACHED
-        left, e = left[far], e[far]
-        if not len(left):
-            break
-        J, size = arm.jacobian(q[left]), np.sum(e**2, axis=1)
-        M = np.swapaxes(J, 1, 2) @ J
-        M[:, range(arm.n), range(arm.n)] += (1e-3 * np.minimum(size, 1.0) + 1e-14)[:, None]
-        step = np.linalg.solve(M, np.einsum("mri,mr->mi", J, e)[..., None])[..., 0]
-        longest = np.max(np.abs(step), axis=1, keepdims=True)
-        q[left] += step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, 1e-300))
-        e = _twist(arm, q[left], goals[left])
-    return q, np.max(np.abs(_twist(arm, q, goals)), axis=1) < REACHED
+    from robocal_ros.kinematics import newton
 
-
-def _twist(arm: SerialArm, q: Array, goal: Array) -> Array:
-    """Twist (m, 6), base, at the flange from where the arm is to the goals."""
-    here = arm.fk(q)
-    turn = frames.log_rotation(goal[:, :3, :3] @ np.swapaxes(here[:, :3, :3], 1, 2))
-    return np.hstack([goal[:, :3, 3] - here[:, :3, 3], turn])
+    goals = np.array(T_base_flange, dtype=np.float64, order="C")
+    q, left = np.array(arm.turned(start)), np.empty(len(goals))
+    near = 0.1 * REACHED
+    newton.reach_batch(goals, arm.links, arm.T_base_root, STEPS, LONGEST_STEP, near, q, left)
+    reached = left < REACHED
+    q[reached] = arm.read(q[reached])
+    return q, reached
 
 
 def postures(arm: SerialArm, T_base_flange: Array, told: Posture) -> Array:

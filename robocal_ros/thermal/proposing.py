@@ -24,8 +24,8 @@ from robocal_ros.identification.judged import (
 )
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import FrameShift, given_shift
+from robocal_ros.programs.postures import CorrectionModels
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import expected_drift, process_document
 from robocal_ros.thermal.cell_setup import (

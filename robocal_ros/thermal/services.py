@@ -20,8 +20,8 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import FRAME_SHIFT
-from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import PARTS, best_shift
+from robocal_ros.programs.postures import CorrectionModels
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message, transform_message
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text

@@ -11,8 +11,8 @@ from bench.robot_programs import NOMINAL, T_FLANGE_TOOL, drifted, postures
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import PARTS, best_shift
+from robocal_ros.programs.postures import CorrectionModels
 from robocal_ros.ros import endpoints
 from robocal_ros.session.events import bring_into_force
 from robocal_ros.thermal.node import ThermalNode

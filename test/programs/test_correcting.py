@@ -25,13 +25,9 @@ from bench.robot_programs import (
 )
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics.arm import inverse
-from robocal_ros.programs.correcting import (
-    CorrectionModels,
-    ProgramCorrection,
-    dialect_of,
-    report,
-)
+from robocal_ros.programs.correcting import ProgramCorrection, dialect_of, report
 from robocal_ros.programs.points import Posture
+from robocal_ros.programs.postures import CorrectionModels
 from robocal_ros.programs.postures import postures as every_posture
 
 ACTUAL = drifted(NOMINAL, 1)

@@ -21,8 +21,8 @@ from bench.programs import (
 from bench.robot_programs import NOMINAL, drifted, postures
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.arm import inverse
-from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import best_shift, shifted_joints
+from robocal_ros.programs.postures import CorrectionModels
 
 
 @pytest.mark.parametrize("seed", [1, *more(8)])

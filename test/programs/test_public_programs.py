@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from bench.robot_programs import NOMINAL
-from robocal_ros.programs.correcting import DIALECTS, CorrectionModels, ProgramCorrection, report
+from robocal_ros.programs.correcting import DIALECTS, ProgramCorrection, report
 from robocal_ros.programs.points import Dialect
+from robocal_ros.programs.postures import CorrectionModels
 
 pytestmark = pytest.mark.data
 FOLDER = os.environ.get("ROBOCAL_PROGRAMS", "")
