@@ -167,21 +167,20 @@ class _Chain:
 def _chain(arm: SerialArm, q: Array) -> _Chain:
     """Hayati's chain by its definition, see `SerialArm`."""
     T, point, axis = arm.T_base_root, np.empty((arm.n, 3)), np.empty((arm.n, 3))
-    first = T[:3, :3]
-    for joint, (d, theta, a, alpha, beta) in enumerate(arm.mdh):
+    for joint, (d, theta, a, ca, sa, cb, sb, sign, slides) in enumerate(arm.links):
         point[joint], axis[joint] = T[:3, 3], T[:3, 2]
-        value = arm.sign[joint] * q[joint]
-        if arm.prismatic[joint]:
-            d = d + value
-        else:
-            theta = theta + value
-        turns = [[0.0, 0.0, theta], [alpha, 0.0, 0.0], [0.0, beta, 0.0]]
-        Rz, Rx, Ry = (frames.exp_rotation(turn) for turn in turns)
-        if joint == 0:
-            turn = frames.exp_rotation(axis[0] * value)
-            first = turn
-        T = T @ frames.transform(Rz, [0.0, 0.0, d]) @ frames.transform(Rx @ Ry, [a, 0.0, 0.0])
-    return _Chain(point, axis, first)
+        value = sign * q[joint]
+        d, theta = (d + value, theta) if slides else (d, theta + value)
+        c, s = np.cos(theta), np.sin(theta)
+        turn = [[c, -s, 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, d], [0.0, 0.0, 0.0, 1.0]]
+        bend = [
+            [cb, 0.0, sb, a],
+            [sa * sb, ca, -sa * cb, 0.0],
+            [-ca * sb, sa, ca * cb, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+        T = T @ np.array(turn) @ np.array(bend)
+    return _Chain(point, axis, frames.exp_rotation(axis[0] * arm.sign[0] * q[0]))
 
 
 def stance_of(arm: SerialArm, q: Array) -> Stance:
