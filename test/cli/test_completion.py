@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from command import ROOT
+from forked import HANGS_S
 
 pytest.importorskip("argcomplete")
 SHELL = """
@@ -30,7 +31,7 @@ def offered(tmp_path_factory):
         done = subprocess.run(
             ["bash", "-c", SHELL, "bash", line],
             env=os.environ | paths | variables,
-            cwd=folder, capture_output=True, text=True, timeout=60, check=True,
+            cwd=folder, capture_output=True, text=True, timeout=HANGS_S, check=True,
         )  # fmt: skip
         assert not done.stderr
         return {word.strip() for word in done.stdout.splitlines() if word.strip()}

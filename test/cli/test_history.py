@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command import conforms, environment, robocal, robocal_json
+from forked import HANGS_S
 from jsonschema import ValidationError
 
 from robocal_ros.ground.errors import Code
@@ -270,7 +271,7 @@ class TestDeciding:
             )
             for _ in range(2)
         ]
-        said = [json.loads(process.communicate(timeout=30)[0]) for process in both]
+        said = [json.loads(process.communicate(timeout=HANGS_S)[0]) for process in both]
         assert sorted(process.returncode for process in both) == [0, 3]
         for document in said:
             conforms(document, "history.decision.json")

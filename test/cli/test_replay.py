@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from campaign import ROBOT
 from command import conforms, environment, robocal, robocal_json
+from forked import HANGS_S
 from recordings import (
     BETWEEN_S,
     EVENTS,
@@ -379,7 +380,7 @@ def test_memory_does_not_grow_with_the_recording(folder: Path, visits) -> None:
         )
         done = subprocess.run(
             [sys.executable, "-c", script, "replay", str(path), "--robot", ROBOT, "--auto"],
-            capture_output=True, text=True, env=environment(), check=True, timeout=120,
+            capture_output=True, text=True, env=environment(), check=True, timeout=HANGS_S,
         )  # fmt: skip
         status, kilobytes = done.stderr.split()[-2:]
         assert status == "0"

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from campaign import POINTS, ROBOT, postures, true_arm
 from command import ROOT, beyond_rounding, conforms
+from forked import HANGS_S
 from long_form import more
 from recordings import (
     BETWEEN_S,
@@ -491,7 +492,7 @@ class TestInParallel:
     def test_no_worker_outlives_the_command(self, tmp_path, how) -> None:
         process = validating(tmp_path / "report")
         process.send_signal(how)
-        process.wait(timeout=60.0)
+        process.wait(HANGS_S)
 
         def group_is_gone() -> bool:
             try:
@@ -505,7 +506,7 @@ class TestInParallel:
     def test_ctrl_c_ends_all(self, tmp_path) -> None:
         process = validating(tmp_path / "report")
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-        _, words = process.communicate(timeout=60.0)  # beside other work
+        _, words = process.communicate(timeout=HANGS_S)
         assert process.returncode == 130
         assert words.split("\n")[-2] == "robocal: interrupted"
         assert "Traceback" not in words

@@ -11,6 +11,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from forked import HANGS_S
 from histories import BY, in_process, reopened
 from history_workers import SERIAL, proposal
 from long_form import amount
@@ -173,7 +174,7 @@ class TestManyProcesses:
             subprocess.run(
                 [sys.executable, "-c", _ACCEPT, str(history.path.parent), str(number)],
                 check=True,
-                timeout=20,
+                timeout=HANGS_S,
                 env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
             )
             assert reader.data_version() != seen  # at once, so at the next poll

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from command import robocal
+from forked import HANGS_S
 from history_content import content
 
 from robocal_ros.ground.errors import Code
@@ -27,7 +28,7 @@ def played(graph, tmp_path) -> Path:
         env=os.environ | {"ROS_DOMAIN_ID": str(graph.domain)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANGS_S,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cell import KEEP_ALL, Cell, message_of
+from forked import HANGS_S
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -105,7 +106,7 @@ def test_everything_arrives_as_fast_as_it_is_acknowledged(graph, tmp_path):
     graph.spin_until(lambda: len(listener.joints) == count, "all joint states")
     assert [m.position[0] for m in listener.joints] == list(range(count))
     assert len(listener.notes) == count // 10
-    assert process.process.wait(10) == 0
+    assert process.process.wait(HANGS_S) == 0
     status = listener.status
     assert status["sent"]["/joint_states"] == count
     assert status["unacknowledged"] == 0
@@ -227,7 +228,7 @@ def test_a_thermal_node_takes_all_of_a_fast_replay(graph, tmp_path):
     )
     sent = str(sum(isinstance(sample, JointSample) for sample in samples))
     graph.spin_until(lambda: cell.value("joint_states received") == sent, "all arrived")
-    assert player.process.wait(10) == 0
+    assert player.process.wait(HANGS_S) == 0
     answer = cell.call("capture_reference")
     assert (answer.success, answer.samples) == (True, 20)
 
@@ -248,7 +249,7 @@ def test_what_cannot_be_played_or_is_awaited_in_vain_is_said(graph, tmp_path):
 @pytest.mark.parametrize("settings", [{}, {"bag": "/there/is/none.mcap"}])
 def test_who_waits_for_an_end_is_not_left_waiting_where_nothing_can_be_played(graph, settings):
     process = graph.start("replay_node", settings | {"exit_at_end": True})
-    assert process.process.wait(30) == 2
+    assert process.process.wait(HANGS_S) == 2
 
 
 def test_wrong_choices_are_named():
@@ -296,7 +297,7 @@ def test_the_commands_of_the_page_run_as_typed(graph):
     assert typed
     environment = os.environ | {"ROS_DOMAIN_ID": str(graph.domain)}
     for words in typed:
-        done = subprocess.run(words, cwd=ROOT, env=environment, timeout=60, check=False)
+        done = subprocess.run(words, cwd=ROOT, env=environment, timeout=HANGS_S, check=False)
         assert done.returncode == 0, words
 
 
@@ -310,7 +311,7 @@ def test_what_is_damaged_in_the_bag_counts_as_lost(graph, tmp_path):
     listener = Listener(graph)
     process = graph.start("replay_node", {"bag": bag, "rate": 0.0, "exit_at_end": True} | WAIT)
     listener.until("done")
-    assert process.process.wait(10) == 3
+    assert process.process.wait(HANGS_S) == 3
     assert len(listener.joints) < 20_000
     assert "damaged" in " ".join(listener.status["notes"])
     (told,) = listener.status["lost"]
@@ -347,7 +348,7 @@ def test_what_may_be_lost_is_said_in_the_same_way_and_ends_alike(graph, tmp_path
     graph.spin_until(lambda: "hears" in deaf.output, "they have found each other")
     deaf.process.send_signal(signal.SIGSTOP)
     listener.until("done")
-    assert process.process.wait(10) == 3
+    assert process.process.wait(HANGS_S) == 3
     late, unconfirmed = listener.status["lost"]
     assert re.fullmatch(r"perhaps lost: \d+ messages that were not acknowledged", late)
     assert unconfirmed.startswith("perhaps lost: messages of /joint_states to best-effort ")

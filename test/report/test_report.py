@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from forked import HANGS_S
 
 from robocal_ros.cli.validating import changes_of
 from robocal_ros.ground.errors import Code
@@ -392,7 +393,7 @@ def test_no_table_is_wider_than_the_page(tmp_path, paper, width):
     done = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900",
          "--dump-dom", file.as_uri()],
-        capture_output=True, text=True, check=True, timeout=60,
+        capture_output=True, text=True, check=True, timeout=HANGS_S,
     )  # fmt: skip
     (title,) = re.findall("<title>(.*)</title>", done.stdout)
     sizes = [[int(part) for part in pair.split("/")] for pair in title.split()]

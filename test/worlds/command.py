@@ -12,14 +12,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from forked import become, forks
+from forked import HANGS_S, become, forks
 from jsonschema import Draft202012Validator
 
 from robocal_ros.bags.replay import NOT_BITS
 
 ROOT = Path(__file__).parents[2]
 SCHEMAS = {path.name: json.loads(path.read_text()) for path in (ROOT / "docs/schemas").glob("*")}
-HANGS_S = 180.0  # what only waits for busy cores is sooner done
 COMMAND = [sys.executable, "-m", "robocal_ros.cli.main"]
 
 

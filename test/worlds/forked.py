@@ -16,6 +16,7 @@ from typing import Any
 from unittest.mock import patch
 
 PR_SET_PDEATHSIG = 1
+HANGS_S = 900.0  # a process that only waits for busy cores has ended before
 
 
 @cache

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from forked import HANGS_S
 from history_workers import SERIAL, proposal
 
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -21,7 +22,7 @@ def reopened(history: CalibrationHistory, **options: Any) -> CalibrationHistory:
     return CalibrationHistory.open(history.serial, state_dir=history.path.parent, **options)
 
 
-def in_process(work: str, *arguments: object, timeout_s: float = 30.0) -> Any:
+def in_process(work: str, *arguments: object) -> Any:
     """Run a worker in a process group of its own, which never outlives the test."""
     script = Path(__file__).with_name("history_workers.py")
     command = [sys.executable, str(script), work, *(str(a) for a in arguments)]
@@ -34,7 +35,7 @@ def in_process(work: str, *arguments: object, timeout_s: float = 30.0) -> Any:
         env=os.environ | {"PYTHONPATH": root},
     ) as process:
         try:
-            out, _ = process.communicate(timeout=timeout_s)
+            out, _ = process.communicate(timeout=HANGS_S)
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
