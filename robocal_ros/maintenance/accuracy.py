@@ -308,6 +308,7 @@ class Memory:
         except Exception:
             self.running, self.runs = "", self.runs - 1
             raise
+        self.earlier -= {cycle_id}  # an id of long ago, which is not among `cycles` any more
         return CycleResult(cycle_id, stamp_ns=wall_ns, run=self.runs)
 
     def end(self, result: CycleResult, fault_code: Code = Code.NONE, fault: str = "") -> None:

@@ -62,6 +62,20 @@ def test_a_cycle_of_before_a_restart_is_told_to_be_old(history):
     assert (new.run, cell.session.memory.words_of(new)) == (3, new.message)
 
 
+def test_an_id_of_long_ago_that_comes_again_is_no_old_cycle(cell):
+    """Finding: of a cycle that moved the robot it was told that nothing runs."""
+    cell.ran("c1")
+    cell.restart()
+    cell.open_gap()
+    session = cell.session
+    del session.memory.cycles["c1"]  # as the 200 cycles after it do
+    cell.begun.clear()
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    assert session.running is not None
+    assert session.memory.words_of(session.running) == ""
+    assert "c1" not in session.memory.earlier
+
+
 def test_a_cycle_that_was_killed_has_its_run_and_when_it_began(history):
     cell = opened(history)
     cell.run("c1", LONG_S)
