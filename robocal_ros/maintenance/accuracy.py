@@ -128,6 +128,11 @@ class DocumentStore(Protocol):
         """Keep it; raises a `RobocalError` when that fails."""
 
 
+def utc_of(stamp_ns: int) -> str:
+    """A time of the wall clock for a person, to the second."""
+    return f"{np.datetime64(stamp_ns, 'ns').astype('datetime64[s]')}Z"
+
+
 @dataclass(frozen=True)
 class CycleResult:
     """How a maintenance cycle ended, or how far it has come."""
@@ -325,8 +330,7 @@ class Memory:
         """How a cycle ended; of one from before this start it is said that it is old."""
         if result.cycle_id not in self.earlier:
             return result.message
-        ended = str(np.datetime64(result.stamp_ns, "ns").astype("datetime64[s]")) + "Z"
-        when = f", run {result.run}, {ended}" if result.run else ""
+        when = f", run {result.run}, {utc_of(result.stamp_ns)}" if result.run else ""
         return (
             f"cycle '{result.cycle_id}' is one of before this start of the node{when}; nothing "
             f"runs now; it ended so: {result.message}"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL, Head
-from robocal_ros.maintenance.accuracy import UNKNOWN, CycleResult, Memory, ToolRecord
+from robocal_ros.maintenance.accuracy import UNKNOWN, CycleResult, Memory, ToolRecord, utc_of
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
 from robocal_ros.maintenance.fixture_part import JUDGED, FixturePart, FixtureVisits
 from robocal_ros.maintenance.fixture_part import MEASUREMENT as FIXTURE_MEASUREMENT
@@ -238,7 +238,9 @@ class ToolPart:
         try:
             answer = yield from cell.arm()
             if answer.done:
-                answer = yield from cell.measure(mode, cycle_id, cell.run_s(mode))
+                # of this run alone: an id of long ago is answered with what was found then
+                name = f"{cycle_id} of {utc_of(self._memory.began_ns)}"
+                answer = yield from cell.measure(mode, name, cell.run_s(mode))
         except SilentError as error:
             answer = DriverAnswer(Code.CONFLICT, str(error))
         before = self._memory.tool

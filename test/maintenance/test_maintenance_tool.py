@@ -27,6 +27,7 @@ from maintenance_tools import (
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.history_records import THERMAL, TOOL
+from robocal_ros.maintenance import robot_interface as ask
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.session.events import ACCEPT, ROLLBACK
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
@@ -44,6 +45,16 @@ def test_a_check_in_the_future_is_none(cell, monkeypatch):
     monkeypatch.setattr(maintenance_cell, "WALL_NS", maintenance_cell.WALL_NS - DAY_NS)
     assert level(cell) is AccuracyLevel.EXPIRED
     a_check_passes(cell, "c2")
+
+
+def test_an_id_of_long_ago_that_comes_again_measures_the_tool_again(cell):
+    """Finding: tcf_node gives the answer of a name again, and an old one counted as new."""
+    for _ in range(2):
+        cell.ran("c1")
+        cell.session.memory.cycles.clear()  # as 200 cycles after it do
+        cell.begun.clear()
+    names = [request.cycle_id for request in cell.log if isinstance(request, ask.Measure)]
+    assert len(names) == len(set(names)) == 2
 
 
 @pytest.mark.parametrize("told", [wrong_tool(), WITHOUT_WAY])
