@@ -64,7 +64,7 @@ class _Writer:
 
 
 class HeartbeatInput:
-    """Passes each write of the heartbeat on once; never one that is not new.
+    """Passes each write of the heartbeat on once; never one that is not new, but for a 0.
 
     The heartbeat is one number, so that no client can write half of it: the beat that the program
     has read while the robot may be moved, 0 while it may not.
@@ -77,16 +77,18 @@ class HeartbeatInput:
         """Take a write of a session.
 
         A writer that gives times must give later ones: what repeats an old one is a gateway that
-        has latched it. While two sessions write, the gap is closed, whatever they say.
+        has latched it; a 0 closes the gap all the same. While two sessions write, it is closed,
+        whatever they say.
         """
         before = self._writers.get(session)
         if before is not None and before.source_ns is not None:
+            closes = None if echo else Heartbeat(0, now_s)
             if source_ns is None:
-                return HeartbeatWrite(INVALID_TIME, None, "without the time that came before")
+                return HeartbeatWrite(INVALID_TIME, closes, "without the time that came before")
             if source_ns <= before.source_ns:
                 late_s = (before.source_ns - source_ns) * 1e-9
                 words = f"{late_s:.3f} s before the last one: repeated, or a clock set back"
-                return HeartbeatWrite(INVALID_TIME, None, words)
+                return HeartbeatWrite(INVALID_TIME, closes, words)
         self._writers[session] = _Writer(now_s, source_ns)
         others = [
             name

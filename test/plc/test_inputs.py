@@ -12,6 +12,7 @@ from robocal_ros.plc.cell import (
     GOOD,
     INVALID_TIME,
     BeamInput,
+    Heartbeat,
     HeartbeatInput,
 )
 
@@ -37,7 +38,7 @@ def test_a_heartbeat_is_passed_on_at_most_once_and_only_of_one_writer(writes):
         latched = known is not None and (source_ns is None or source_ns <= known)
         assert (came.status == INVALID_TIME) is latched
         if latched:
-            assert came.passed is None
+            assert came.passed == (None if echo else Heartbeat(0, now_s))
             assert came.words
             continue
         if source_ns is not None:
@@ -56,6 +57,15 @@ def test_a_new_session_begins_anew_and_an_ended_one_contests_nothing():
     assert heard.write("first", 5, 1000, 0.0).status == GOOD
     heard.end("first")
     assert heard.write("second", 6, 10, 0.1).passed.echo == 6  # a PLC whose clock began again
+
+
+def test_a_0_closes_the_gap_whatever_its_time():
+    """Finding: of a PLC whose clock was set back, or that gave no time, the robot moved on."""
+    heard = HeartbeatInput()
+    assert heard.write("plc", 5, 1000, 0.0).passed == Heartbeat(5, 0.0)
+    for source_ns in (None, 999, 1000):
+        came = heard.write("plc", 0, source_ns, 0.1)
+        assert (came.status, came.passed) == (INVALID_TIME, Heartbeat(0, 0.1))
 
 
 STEP = 10_000_000
