@@ -341,6 +341,18 @@ class CellProcessor(UaProcessor):
             return goes_on
         return bool(await super().process(header, body))
 
+    async def close(self) -> None:
+        """End a connection with its session, also where that has only timed out.
+
+        A PLC that lost its power says no good-bye, and would keep its place for ever.
+        """
+        await super().close()
+        self._transport.abort()
+
+    def _should_close_session_on_transport_loss(self) -> bool:
+        """With subscriptions too, for no other connection may take it over."""
+        return True
+
     async def process_message(self, seqhdr: Any, body: Buffer) -> Any:
         """Serve a service; a call beside what comes after it."""
         if nodeid_from_binary(body.copy()) != CALL:

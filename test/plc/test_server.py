@@ -280,6 +280,36 @@ def test_a_client_that_connects_again_leaves_no_session(
         become(1)
 
 
+def test_a_client_that_is_gone_without_a_word_gives_its_place_back(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finding: where a PLC lost its power its session ended; its connection stayed, one of 50."""
+    server = served.thread.cell.model._server.iserver
+    monkeypatch.setattr(server, "min_session_timeout_ms", 1000.0)
+    monkeypatch.setattr(server, "max_session_timeout_ms", 1000.0)
+    monkeypatch.setattr(server, "max_pending_activation_seconds", 0.0)  # long over in a shift
+    with contextlib.closing(PlcClient(served.folder, served.port, "ada")) as other:
+        client = other.client = other.do(other.secured(other.made()))
+        client._watchdog_intervall = 10.0 * UP_S  # it says nothing by itself
+        other.do(client.connect())
+        connection = client.uaclient.protocol
+        assert connection is not None
+        _until(lambda: connection.transport is None)
+    served.works()
+
+
+def test_a_session_whose_socket_is_lost_ends_with_its_subscriptions(served: Served) -> None:
+    """Finding: asyncua keeps it for another connection, which may not take it over here."""
+    state = served.thread.state
+    _until(lambda: len(state.sessions) == 1)  # the fixture's own
+    with contextlib.closing(PlcClient(served.folder, served.port, "ada")) as other:
+        other.do(other.connect())
+        other.do(other._watch())
+        _until(lambda: len(state.sessions) == 2)
+        other._loop.call_soon_threadsafe(other.client.uaclient.protocol.transport.abort)
+        _until(lambda: len(state.sessions) == 1)
+
+
 def test_a_call_that_nobody_answers_ends_in_time(served: Served) -> None:
     served.forget()
     began_s = time.monotonic()
