@@ -233,6 +233,9 @@ class Mover:
 
     def require_stopped(self) -> None:
         """Refuse what needs a robot at rest while a stop was not seen yet, as in a pause."""
+        if self.stopping.under_way and self.unheard:
+            words = "nobody knows whether the robot has stopped: look at its driver and network"
+            raise TooFewSamplesError(f"{self.unheard}: {words}")
         if self.stopping.under_way:
             raise ConflictError(
                 "a stop is under way: wait until the robot stands, and let a paused one run"

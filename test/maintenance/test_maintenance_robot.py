@@ -158,6 +158,16 @@ def test_a_fault_is_not_acknowledged_before_its_stop_was_seen(cell):
     assert refused(lambda: cell.session.acknowledge("me"), "not at home") is Code.LIMIT_EXCEEDED
 
 
+def test_a_stop_that_nobody_can_see_is_no_pause(cell):
+    """Finding: joint states had died, and a person was told to wait until the robot stands."""
+    until_moving(cell, "thermal")
+    cell.silent = True
+    cell.pass_time(0.5)
+    assert cell.state is MaintenanceState.FAULT
+    words = r"^joint states are silent for 0\.5. s: nobody knows whether the robot has stopped"
+    assert refused(lambda: cell.session.acknowledge("me"), words) is Code.TOO_FEW_SAMPLES
+
+
 def test_a_fault_away_from_home_is_not_acknowledged(cell):
     until_moving(cell, "tool")
     cell.is_open = False
