@@ -3,6 +3,7 @@
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -31,7 +32,7 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.maintenance import robot_interface
-from robocal_ros.maintenance.robot_interface import DriverAnswer, DriverRequest, Move
+from robocal_ros.maintenance.robot_interface import MOST_ASKED, DriverAnswer, DriverRequest, Move
 from robocal_ros.maintenance.services import (
     SETTINGS,
     MaintenanceOutputs,
@@ -86,6 +87,7 @@ class MaintenanceDriver:
         self._measure = ActionClient(node, MeasureTool, "tcf_node/measure")
         self._goals: dict[int, Any] = {}  # handles; None until the goal is accepted
         self._cancelled: set[int] = set()
+        self._asked: deque[tuple[Any, Future]] = deque()  # newest calls of services
 
     def close(self) -> None:
         """Take the actions' clients down."""
@@ -130,9 +132,14 @@ class MaintenanceDriver:
             words = f"{client.srv_name} is not there: start its node"
             self._answered(number, DriverAnswer(Code.CONFLICT, words, absent=True))
             return
-        client.call_async(request).add_done_callback(
+        asked = client.call_async(request)
+        asked.add_done_callback(
             guarded(self._node, lambda future: self._answered(number, read(future.result())))
         )
+        self._asked.append((client, asked))
+        if len(self._asked) > MOST_ASKED:  # rclpy keeps what is never answered
+            oldest, never = self._asked.popleft()
+            oldest.remove_pending_request(never)
 
     def _begin_measure(self, number: int, mode: str, cycle_id: str) -> None:
         if not self._measure.server_is_ready():

@@ -203,6 +203,7 @@ class Asking:
 
 AGAIN_S = 0.5
 GONE_S = 5.0
+MOST_ASKED = 20  # that may be answered yet: of those that wait for a node DDS keeps ten
 SENT = "what the tool node sent may still be driven"
 
 
@@ -230,6 +231,8 @@ class Disarming:
         if self._newest in self._asked:
             self._absent_from_s = np.inf
         self._asked.add(number)
+        if len(self._asked) > MOST_ASKED:  # the node hangs, for days perhaps
+            self._asked.remove(min(self._asked))
         self._newest, self._heard, self._asked_s = number, False, now_s
 
     def answered(self, number: int, answer: DriverAnswer, now_s: float) -> None:

@@ -26,7 +26,13 @@ from maintenance_cell import (
 )
 
 from robocal_ros.ground.errors import Code, ConflictError
-from robocal_ros.maintenance.robot_interface import DEAF_S
+from robocal_ros.maintenance.robot_interface import (
+    AGAIN_S,
+    DEAF_S,
+    MOST_ASKED,
+    Disarming,
+    DriverAnswer,
+)
 from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.motion.robot_watch import VELOCITY_S
@@ -118,6 +124,16 @@ def test_a_tool_node_that_hangs_is_not_let_go(history):
     assert not cell.session.status(cell.now_s).disarmed
     cell.pass_time(GONE_S)
     assert cell.session.status(cell.now_s).disarmed
+
+
+def test_disarms_that_a_node_never_answers_do_not_pile_up():
+    tool = Disarming()
+    tool.doubt()
+    for number in range(1, 1000):
+        tool.asked(number, number * AGAIN_S)
+    assert len(tool._asked) == MOST_ASKED
+    tool.answered(990, DriverAnswer(Code.ACCEPT), 500.0)  # it wakes, with what waited for it
+    assert not tool.engaged
 
 
 @pytest.mark.parametrize("how", ["closed", "cancelled"])

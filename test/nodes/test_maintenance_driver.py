@@ -13,13 +13,14 @@ from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionServer, GoalResponse
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
+from std_srvs.srv import SetBool
 from trajectory_controllers import HOME as Q_UR10
 from trajectory_controllers import accepted_goals
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceDriver
-from robocal_ros.maintenance.robot_interface import Move
+from robocal_ros.maintenance.robot_interface import MOST_ASKED, Disarm, Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPIES, COPY_S, MotionDriver
 from robocal_ros.motion.plan import JointPlan, MotionLimits, stop
@@ -76,6 +77,18 @@ def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
     graph.spin_until(lambda: len(inbox) == 1, "the motion goes out")
     driver.close()
     node.destroy_node()
+
+
+def test_what_a_node_that_hangs_never_answers_does_not_pile_up(graph: Any) -> None:
+    node, motion = driving(graph, ("a",))
+    driver = MaintenanceDriver(node, motion, lambda number, answer: None, lambda: None)
+    graph.at_close.insert(0, driver._measure.destroy)
+    hangs = graph.other("tcf_node")  # nothing spins it
+    hangs.create_service(SetBool, "tcf_node/arm", lambda request, response: response)
+    graph.spin_until(driver._arm.service_is_ready, "its service")
+    for number in range(1, 3 * MOST_ASKED):
+        driver.carry_out(Disarm(number))
+    assert len(driver._arm._pending_requests) == MOST_ASKED
 
 
 def test_each_motion_goes_by_the_action_that_is_there_when_it_begins(graph: Any) -> None:
