@@ -207,8 +207,10 @@ class PanelNode(HouseNode):
         refused = self._calls.call(called.service, called.fields, called.user, called.until_s, done)
         if refused is Refusal.LATE:
             self._tell(f"{called.act} of {called.user} came too late and is not passed on")
-        elif refused is not None:
-            _answer(called, False, refused.value)
+        elif refused is Refusal.ABSENT:
+            _answer(called, False, "maintenance_node is not there: start it")
+        elif refused is Refusal.INACTIVE:
+            _answer(called, False, f"{self.get_name()} is {self.state}: activate it")
 
     def _answered(self, called: Any, response: Any) -> None:
         if isinstance(response, Exception):

@@ -211,11 +211,12 @@ def test_requests_hold_up_no_executor_and_nothing_is_passed_on_late(graph, loop,
     assert time.monotonic() - began_s < 2.0
     graph.spin_for(ANSWER_S)
     assert not called
-    assert page.post("/act/run") == (200, {"done": False, "message": "nobody serves it"})
+    absent = {"done": False, "message": "maintenance_node is not there: start it"}
+    assert page.post("/act/run") == (200, absent)
     page.node.trigger_deactivate()
     graph.spin_for(0.2)
-    answer = page.post("/act/cancel")
-    assert answer == (200, {"done": False, "message": "this node is not active"})
+    inactive = {"done": False, "message": "panel_node is inactive: activate it"}
+    assert page.post("/act/cancel") == (200, inactive)
     assert page.do(page.event(lambda told: True))  # it shows on
     page.close()
 
