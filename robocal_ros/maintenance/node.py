@@ -305,7 +305,9 @@ class MaintenanceNode(RobotNode):
         if self._session is not None:
             self._carry_out(self._session.give_up(ENDS, self._steady.now_s()))
             if self._motion.see_through(self._stops):
-                self._lease.hold("")  # else it lapses, and counts until the robot stands
+                self._lease.hold("")
+            else:
+                self._lease.lapse()
             self._session.close()
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")

@@ -677,3 +677,7 @@ class LeaseHolder:
                 purpose=purpose,
             )
         )
+
+    def lapse(self) -> None:
+        """Say no more of it, nor that it is let go: it counts until the robot has stood."""
+        self._held = False

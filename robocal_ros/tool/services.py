@@ -291,7 +291,9 @@ class TcfMotion:
         if self.driver is not None:
             self.driver.disarm("the node was deactivated", self._steady.now_s())
             if self._motion.see_through(self._stops):
-                self._lease.hold("")  # else it lapses, and counts until the robot stands
+                self._lease.hold("")
+            else:
+                self._lease.lapse()
         self.driver = None
 
     def _stops(self) -> bool:

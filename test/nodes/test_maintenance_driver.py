@@ -11,6 +11,7 @@ import pytest
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionServer, GoalResponse
+from robocal_msgs.msg import MotionLease
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
@@ -22,7 +23,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceDriver
 from robocal_ros.maintenance.robot_interface import MOST_ASKED, Disarm, Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import COPIES, COPY_S, MotionDriver
+from robocal_ros.motion.driver import COPIES, COPY_S, LeaseHolder, MotionDriver
 from robocal_ros.motion.plan import JointPlan, MotionLimits, stop
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.motion.stopping import SteadyClock
@@ -283,3 +284,19 @@ def test_a_suspend_is_told_once_and_counts(monkeypatch: pytest.MonkeyPatch) -> N
     for _ in range(1000):
         clock.now_s()
     assert abs(sum(told) - 3600.0) < PREEMPTED_S
+
+
+def test_a_lease_that_lapsed_is_not_let_go_by_who_begins_anew(graph: Any) -> None:
+    """Finding: a node that was deactivated before its robot stood, and activated again, did so."""
+    node = EndpointNode("holder", context=graph.context, use_global_arguments=False)
+    lease, told = LeaseHolder(node, "robot", "serial"), graph.collect(MotionLease, "motion_lease")
+    graph.at_close.append(node.destroy_node)
+    node.trigger_configure()
+    node.trigger_activate()
+    graph.spin_until(lambda: node.count_subscribers("/motion_lease") > 0, "the probe listens")
+    lease.hold("a stop")
+    lease.lapse()
+    lease.hold("")
+    lease.hold("another motion")
+    graph.spin_until(lambda: len(told) == 2, "both are told")
+    assert [one.held for one in told] == [True, True]
