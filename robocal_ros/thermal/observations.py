@@ -307,7 +307,8 @@ class ObservationDesk:
         """Observations with ``after_ns < stamp <= until_ns`` made of samples up to ``marks``.
 
         Ordered by stamp and target. Of a target measured twice at one stamp the pose counts,
-        else the first; the first observation gives the measuring frame where none is set.
+        else the first; a sphere that is fixed in the cell is no such target, whatever its name.
+        The first observation gives the measuring frame where none is set.
         """
         joints = marks.get(JOINTS, -1)
         found = [
@@ -325,11 +326,12 @@ class ObservationDesk:
             for other in [o.sample for o in self._observed if o.sample.frame != self.frame]:
                 self._ignore_frame(other)
             self._observed = [o for o in self._observed if o.sample.frame == self.frame]
-        once: dict[tuple[int, str], Observation] = {}
+        once: dict[tuple[int, str, bool], Observation] = {}
         for observation in found:
             sample = observation.sample
             if sample.frame == self.frame:
-                once.setdefault((sample.stamp_ns, sample.target), observation)
+                fixed = sample.topic == REFERENCE_SPHERE
+                once.setdefault((sample.stamp_ns, sample.target, fixed), observation)
         return list(once.values())
 
     def unused(self, from_ns: int) -> list[Observation]:

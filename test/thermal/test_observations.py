@@ -2,6 +2,7 @@
 """Pairing of measurements and joints: by stamps alone."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from robocal_ros.ground.samples import (
     JUMPS,
     MEASURED_POINT,
     MEASURED_POSE,
+    REFERENCE_SPHERE,
     JointSample,
     JointStream,
     PointSample,
@@ -193,6 +195,21 @@ def test_a_target_counts_once_at_a_stamp_and_the_pose_before_the_point():
     assert found[0].sample.position_m[0] == 1.0
     samples = as_measurements(found).sample
     assert len(set(samples)) == 3
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_sphere_in_the_cell_may_have_the_stamp_and_the_name_of_the_target(first):
+    """A scanner that sees both at once gives them one header."""
+    d = desk()
+    stand(d, 1000, 2000)
+    both = [point(1500), replace(point(1500, 9.0), topic=REFERENCE_SPHERE)]
+    for sample in (both[first], both[1 - first]):
+        d.add_measurement(sample)
+    found = d.window(-1, 2**62, ALL | {REFERENCE_SPHERE: 2**62})
+    assert {o.sample.topic: o.sample.position_m[0] for o in found} == {
+        MEASURED_POINT: 1.0,
+        REFERENCE_SPHERE: 9.0,
+    }
 
 
 def test_orientations_only_where_all_have_one():
