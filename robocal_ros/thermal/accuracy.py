@@ -226,7 +226,7 @@ def _follow(learned: LearnedProcess, shift: EarlierShift, every: int) -> tuple[D
     for i, (cycle, time_s) in enumerate(zip(shift.cycles, shift.time_s.tolist(), strict=True)):
         if learned.gains is not None and shift.temperature is not None:
             tracker.read_temperatures(shift.temperature[i], time_s)
-        if i % every == 0:
+        if i % every == 0 and len(cycle):  # of some of its poses a cycle may have visited none
             total += tracker.take(cycle, time_s).log_likelihood
     return tracker, total
 

@@ -115,6 +115,15 @@ def test_what_is_learned_tracks_a_further_shift(arm):
     assert np.mean(inside) > 0.8  # three robots: their errors hang together
 
 
+def test_a_cycle_without_the_poses_that_judge_teaches_by_its_own(arm):
+    """Every second of fourteen poses judges a shift; a cycle cut short may have none of them."""
+    cell, q, rng = cell_of(arm), postures(14), np.random.default_rng(5)
+    cycles = [visit(cell, part, rng) for part in (q[1:7:2], *[q] * 10)]
+    time_s = PERIOD_S * np.arange(1.0, len(cycles) + 1)
+    shift = EarlierShift(ColdSpots.of(cell, visit(cell, q, rng)), cycles, time_s)
+    assert learn_process([shift]).sigma_m == pytest.approx(SIGMA, rel=0.25)
+
+
 def test_what_cannot_teach_is_refused(arm):
     rng = np.random.default_rng(3)
     shift = shift_of(arm, gains_of(arm, rng), rng)
