@@ -421,7 +421,7 @@ def _solved(
     arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method
 ) -> tuple["_Solved | None", _FullProblem]:
     """The full model, where the evidence wants one, and the problem of the geometric model."""
-    start = identify(bare(arm), data, fit=fit, method=method)
+    start = replace(identify(bare(arm), data, fit=fit, method=method), nominal=arm)
     load = arm.load or ArmLoad.unknown(arm.n)
     data = replace(data, q=np.ascontiguousarray(data.q))
     problem = _FullProblem(start, data, start.lever_m)

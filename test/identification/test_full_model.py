@@ -203,6 +203,17 @@ def test_of_many_poses_those_are_kept_that_tell_the_covariance(bent, monkeypatch
     assert np.sqrt(told[1] / told[0]) == pytest.approx(1.0, abs=0.1)
 
 
+def test_a_model_of_an_arm_with_functions_corrects_that_arm(bent, fewer):
+    """Its history asks for the hash of the nominal model, functions and all."""
+    robot, data = fewer
+    functions = bent[3].cell.arm.functions
+    wrong = replace(functions, coefficients=-functions.coefficients, identified_from=None)
+    arm = robot.nominal.with_model(robot.nominal.mdh, wrong, robot.nominal.load)
+    found = identify_full(arm, data)
+    assert isinstance(found, FullIdentification)
+    assert found.nominal.model_hash == arm.model_hash != robot.nominal.model_hash
+
+
 def test_an_arm_that_keeps_nothing_says_so(bent):
     robot, *_ = bent
     with pytest.raises(InputError, match="does not say what it was identified from"):
