@@ -63,6 +63,8 @@ class JointTerms:
     ) -> "JointTerms":
         """All terms that readings (m, n) and, where it is known, gravity torque (m, n) can have.
 
+        A joint that stands still has no function: it would be a constant, which theta0 is too.
+
         ``coarse``: with half of the splines, to search with.
         """
         lower, span = q.min(axis=0), np.ptp(q, axis=0)
@@ -73,7 +75,7 @@ class JointTerms:
             before=before,
             first=lower - (MARGIN + 3) * step,
             step=np.full(q.shape[1], step),
-            count=np.ceil(span / step).astype(np.int64) + 2 * MARGIN + 3,
+            count=np.where(span > 0.0, np.ceil(span / step).astype(np.int64) + 2 * MARGIN + 3, 0),
             bends=largest > 1e-3 * max(float(largest.max()), 1e-9),
             torque_scale=np.maximum(largest, 1e-9),
         )

@@ -214,6 +214,17 @@ def test_a_model_of_an_arm_with_functions_corrects_that_arm(bent, fewer):
     assert found.nominal.model_hash == arm.model_hash != robot.nominal.model_hash
 
 
+def test_a_joint_that_stood_still_has_no_function():
+    """As one that was locked: what its function would be there its zero is, too."""
+    robot = BentRobot(6)
+    q = robot.poses(250)
+    q[:, 2] = 0.3
+    found = identify_full(robot.nominal, robot.measured(q))
+    assert isinstance(found, FullIdentification)
+    assert found.known.terms.count[2] == 0
+    known_model(found.cell.arm)
+
+
 def test_an_arm_that_keeps_nothing_says_so(bent):
     robot, *_ = bent
     with pytest.raises(InputError, match="does not say what it was identified from"):
