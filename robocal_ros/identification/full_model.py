@@ -162,7 +162,7 @@ class _FullProblem:
         """Few poses can be met exactly: their noise is not taken to be functions for the most."""
         if self.data.sigma is not None:
             return 1.0
-        return SMALLEST_SHARE * self.start.estimate.scale if len(self.data) <= MANY_POSES else 0.0
+        return SMALLEST_SHARE * self.start.estimate.scale if self.poses <= MANY_POSES else 0.0
 
     @cached_property
     def limit(self) -> float:
@@ -182,6 +182,11 @@ class _FullProblem:
     def pose(self) -> Index:
         """Number (m,) of each sample's pose: visits of one pose share it."""
         return pose_groups(self.data.q)
+
+    @property
+    def poses(self) -> int:
+        """How many poses there are, however often each was measured."""
+        return 1 + int(self.pose.max())
 
     @cached_property
     def visit(self) -> Index:
@@ -340,10 +345,10 @@ def identify_full(
     if full is None:
         return rival.start
     left_out, squared = full.left_out
-    gain = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
+    gain = GAIN if rival.poses > MANY_POSES else CLEAR_GAIN
     if left_out >= gain * rival.geometric_left_out():
         return rival.start
-    if len(data) <= CHOSEN_ANEW:
+    if rival.poses <= CHOSEN_ANEW:
         foretold = _foretold(arm, data, fit, method, gain)
         if foretold is None:
             return rival.start
@@ -431,7 +436,8 @@ def _solved(
         rival = min(
             problem, _FullProblem(held, data, held.lever_m), key=_FullProblem.geometric_left_out
         )
-    if 3.0 * len(data) < FEWEST_NUMBERS * before or start.estimate.creeping:
+    told = 3.0 * (1 + int(problem.visit.max()))
+    if told < FEWEST_NUMBERS * before or start.estimate.creeping:
         return None, rival
     try:
         return _by_rounds(problem, load), rival

@@ -446,8 +446,7 @@ class Windows:
         if not found:
             raise TooFewSamplesError(desk.why_nothing())
         sets_up = command.name in events.SET_UP
-        if reference is not None or sets_up:
-            found = one_per_visit(found, self._config.standstill.tolerance_rad)
+        found = one_per_visit(found, self._config.standstill.tolerance_rad)
         sigma_m = None  # a calibration finds its noise itself
         if reference is not None and not sets_up:
             sigma_m = self._config.sigma_m

@@ -462,6 +462,21 @@ def test_visits_of_one_pose_are_no_new_poses():
     assert rms_mm(again, check) == pytest.approx(rms_mm(once, check), rel=0.1)
 
 
+def test_what_is_stated_of_few_poses_holds_however_often_each_was_measured():
+    """Twenty poses with twelve rows each are no 240: a bound of 95 % at others, about as wide."""
+    robot = BentRobot(7)
+    data, target = robot.measured(robot.poses(20)), np.zeros(300, dtype=np.int64)
+    often = data.take(np.repeat(np.arange(20), 12))
+    position = often.position + 1e-5 * robot.rng.standard_normal((240, 3))
+    often = replace(often, position=position, sample=tuple(map(str, range(240))))
+    q, bounds = robot.poses(300), []
+    for found in (identify_full(robot.nominal, one) for one in (data, often)):
+        variance = found.predicted_variance(q, target) + found.noise_m**2 * np.eye(3)
+        total = np.mean(np.trace(variance, axis1=1, axis2=2))
+        bounds.append(np.sqrt(total * found.bound_squared))
+    assert bounds[1] == pytest.approx(bounds[0], rel=0.25)
+
+
 def test_a_pose_left_out_errs_as_by_a_fit_without_it():
     """All visits of a pose left out together, by normal equations that never had them."""
     robot = BentRobot(4)

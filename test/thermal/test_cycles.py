@@ -248,6 +248,17 @@ def test_a_visit_counts_once_however_often_it_is_measured(cell):
     assert inputs["sigma"] == pytest.approx(np.full(POSES, CONFIG.sigma_m))
 
 
+def test_so_does_one_of_a_calibration(tmp_path):
+    cell = Cell(tmp_path)
+    for sample in cell.shift.visit(cell.cold, cell.q):
+        cell.session.add(sample)
+        if isinstance(sample, PointSample):
+            cell.session.add(replace(sample, stamp_ns=sample.stamp_ns + NS // 100))
+    desk = cell.session.desk
+    identify = events.Command(events.IDENTIFY, {}, cell.shift.now_ns, desk.marks)
+    assert len(cell.session.windows.of(identify)[0]) == POSES
+
+
 def test_a_restart_goes_on_from_the_same_state(tmp_path):
     """Cycles with restarts in between, beyond a kept state: the same bits as without."""
     cells = [Cell(tmp_path / name) for name in ("steady", "restarted")]
