@@ -484,8 +484,9 @@ def _predicted(
     target = np.array([known.get(name, 0) for name in check.target], dtype=np.int64)
     variance = result.predicted_variance(check.q, target, without=refit)
     model = float(np.mean(np.trace(variance, axis1=1, axis2=2)))
-    sigma = check.sigma
-    noise = result.noise_m if sigma is None else float(np.sqrt(np.mean(sigma**2)))
+    noise = result.noise_m
+    if check.sigma is not None:  # as much above what is stated as where it was solved from
+        noise = max(1.0, result.estimate.scale) * float(np.sqrt(np.mean(check.sigma**2)))
     model = max(model, 0.0)  # of weak directions rounding is left
     return float(np.sqrt(model)), float(np.sqrt(model + 3.0 * noise**2))
 

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation import estimation
-from robocal_ros.estimation.estimation import describe, observability, require_told
+from robocal_ros.estimation.estimation import (
+    Freedom,
+    describe,
+    information_of,
+    observability,
+    require_told,
+)
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.ground.frames import Array
@@ -306,7 +312,7 @@ def _solve(
         estimate = estimation.solve(
             problem, state, prior_information=prior, noise_known=known, robust=robust
         )
-        if known and estimate.scale > 1.0:
+        if known and (estimate.scale > 1.0 or _contradicted(problem, estimate, prior)):
             known = False
             estimate = estimation.solve(
                 problem, estimate.state, prior_information=prior, noise_known=known, robust=robust
@@ -319,6 +325,23 @@ def _solve(
             break
         lever = settled
     return estimate, lever
+
+
+def _contradicted(
+    problem: CellProblem, estimate: estimation.Estimate[CellModel], prior: Array
+) -> bool:
+    """Whether positions alone are clearly farther off than their sigmas say.
+
+    Orientations beside them, which weigh little, are no proof of the contrary.
+    """
+    if problem.data.rotation is None:
+        return False
+    keep, (residual, J) = ~estimate.rejected, problem.linearise(estimate.state)
+    count = 3 * int(np.sum(keep))
+    told, information = information_of(J[:, :3], keep), information_of(J, keep)
+    left = Freedom.of(count, told, information, prior).at(1.0)
+    misfit = float(np.sum(residual[keep, :3] ** 2))
+    return left >= 1.0 and misfit > estimation.chi2_quantile(estimation.SOUND_FIT, left)
 
 
 def _lever(residual: Array, lever: float, most: float) -> float:

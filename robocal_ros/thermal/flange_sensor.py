@@ -368,7 +368,9 @@ def identify_and_judge_flange_sensor(
     after = np.linalg.norm(result.cell.scatter(check), axis=1)
     sound = ~gross(before, after)
     model = float(result.predicted_variance(check).mean())
-    noise = result.noise_m if check.sigma is None else float(np.sqrt(np.mean(check.sigma**2)))
+    noise = result.noise_m
+    if check.sigma is not None:  # as much above what is stated as where it was solved from
+        noise = max(1.0, result.estimate.scale) * float(np.sqrt(np.mean(check.sigma**2)))
     current = summarise(before[sound])
     workspace_rms_m = result.workspace_rms()
     change_m = result.workspace_change(in_force or arm)

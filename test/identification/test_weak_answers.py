@@ -164,6 +164,23 @@ def test_a_sigma_that_residuals_contradict_changes_the_verdict(factor, code):
     assert ("sigma_mm" in judged.verdict.reason) == (factor != 1.0)
 
 
+def test_orientations_do_not_hide_that_a_sigma_is_too_small(make_cell):
+    """Noise of 1.4 times what is stated of it, and orientations that scatter by little."""
+    cell, rng = make_cell(), np.random.default_rng(9)
+    train, check = (
+        cell.measure(cell.postures(n, rng), rng, noise_m=NOISE_M, noise_rad=1e-5, sigma=True)
+        for n in (150, 100)
+    )
+    stated = [replace(data, sigma=data.sigma / 1.4) for data in (train, check)]
+    judged = identify_and_judge(cell.nominal, *stated)
+    found = judged.identification
+    # of 450 numbers less unknowns, four sigmas
+    assert found.noise_m == pytest.approx(NOISE_M, rel=4.0 / np.sqrt(2.0 * 400.0))
+    assert found.sigma_ratio == pytest.approx(1.4, rel=4.0 / np.sqrt(2.0 * 400.0))
+    expected = judged.predicted_total_rms_m
+    assert judged.candidate.rms_m == pytest.approx(expected, rel=4.0 / np.sqrt(2.0 * 300.0))
+
+
 @pytest.mark.data
 def test_orientations_of_a_real_grid(data_dir):
     """Series A has 25 orientations of the flange; 200 poses of one, positions alone."""
