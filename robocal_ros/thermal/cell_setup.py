@@ -62,7 +62,7 @@ class SensorCalibration:
     centre of the sphere in the flange frame, m. ``covariance``: (9, 9), SI, of ``NAMES``: shift of
     the base and turn about it (sensor axes), and the sphere (flange axes); None for the classic
     method, which has no noise model. ``residual`` (m, 3): predicted minus measured centre, sensor
-    axes, m. ``left_out`` (m,): distance at each pose of a calibration from the others, m.
+    axes, m. ``left_out`` (k,): distance at each pose that fits of a calibration from the others, m.
     ``rejected``: names of the samples that do not fit the others.
     """
 
@@ -95,13 +95,14 @@ def sensor_verdict(found: SensorCalibration) -> Verdict:
         )
     rms_m = float(np.sqrt(np.mean(judged**2)))
     words = f"each pose from the others: {rms_m * 1e3:.3f} mm rms"
+    without = f"; not fitting: {', '.join(found.rejected)}" if found.rejected else ""
     if rms_m > LARGEST_RMS_M:
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
             f"{words}, more than any robot's static error ({LARGEST_RMS_M * 1e3:.0f} mm): check "
-            "robot file, units, joint signs and which sphere was measured",
+            f"robot file, units, joint signs and which sphere was measured{without}",
         )
-    return Verdict(Code.ACCEPT, words)
+    return Verdict(Code.ACCEPT, words + without)
 
 
 def calibrate_sensor(
@@ -133,7 +134,7 @@ def calibrate_sensor(
         sphere_in_flange=cell.T_flange_target[0, :3, 3],
         covariance=covariance,
         residual=cell.residual(data),
-        left_out=_left_out(arm, data, method, rejected),
+        left_out=_left_out(arm, data.take(~rejected), method),
         rejected=tuple(data.sample[i] for i in np.flatnonzero(rejected)),
     )
 
@@ -148,14 +149,11 @@ def place_sensor(
     return placed.cell, placed.estimate.covariance, placed.estimate.rejected
 
 
-def _left_out(
-    arm: SerialArm, data: Measurements, method: SensorMethod, rejected: NDArray[np.bool_]
-) -> Array:
+def _left_out(arm: SerialArm, data: Measurements, method: SensorMethod) -> Array:
     """Distance (m,) at each pose of what the others give; not a number where they give nothing."""
     error = np.full(len(data), np.nan)
     for i in range(len(data)):
-        others = ~rejected
-        others[i] = False
+        others = np.arange(len(data)) != i
         try:
             cell = place_sensor(arm, data.take(others), method)[0]
         except (TooFewSamplesError, RankDeficientError):

@@ -123,7 +123,7 @@ def _show_calibrate_sensor(console: "Console", document: Document) -> None:
         console.print(f"Standard deviations: {words}", soft_wrap=True)
     if left is not None:
         console.print(
-            f"Each of {document['samples']} poses from the others, mm: mean {left['mean_mm']:.3f}, "
+            f"Each of {left['n']} poses from the others, mm: mean {left['mean_mm']:.3f}, "
             f"rms {left['rms_mm']:.3f}, largest {left['max_mm']:.3f}"
         )
     if document["rejected"]:

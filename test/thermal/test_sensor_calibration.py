@@ -10,7 +10,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.cell_setup import calibrate_sensor, place_sensor
+from robocal_ros.thermal.cell_setup import calibrate_sensor, place_sensor, sensor_verdict
 
 SIGMA = 2e-5
 T_SENSOR_BASE, BALL = kr150.T_SENSOR_BASE, kr150.BALL
@@ -82,12 +82,17 @@ def test_moving_the_sensor_moves_the_answer(arm):
     assert moved.sphere_in_flange == pytest.approx(found.sphere_in_flange, abs=1e-9)
 
 
-def test_a_wrong_sample_is_named_and_does_no_harm(arm):
+@pytest.mark.parametrize("off_m", [1e-3, 0.05])
+def test_a_wrong_sample_is_named_and_does_no_harm(arm, off_m):
+    """Nor does it to the verdict, which is of the poses that fit."""
     data = visit(arm, postures(12), np.random.default_rng(2))
-    data.position[4, 1] += 1e-3
+    data.position[4, 1] += off_m
     found = calibrate_sensor(arm, data)
     assert found.rejected == ("4",)
     assert np.linalg.norm(found.sphere_in_flange - BALL) < 5.0 * np.linalg.norm(found.sigma[6:])
+    verdict = sensor_verdict(found)
+    assert verdict.accept, verdict.reason
+    assert "not fitting: 4" in verdict.reason
 
 
 @pytest.mark.parametrize("method", ["ml", "classic"])
