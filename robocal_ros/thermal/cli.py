@@ -326,7 +326,7 @@ def warm_visits(path: Path, arm: SerialArm, cold: Visits, only: str = ONLY_CYCLE
 def check_visits(
     path: Path, arm: SerialArm, cold: Visits, warm: Visits, only: str = ONLY_CYCLE
 ) -> Visits:
-    """Read a table of warm visits of poses that are not in the warm table."""
+    """Read a table of warm visits of poses that are not in the warm table, of its cycles."""
     check = warm_visits(path, arm, cold, only)
     shared = sorted(set(check.pose) & set(warm.pose))
     if shared:
@@ -335,6 +335,13 @@ def check_visits(
             "not used to solve",
             file=str(path),
             column="pose",
+        )
+    if not set(check.cycles) & set(warm.cycles):
+        raise InputError(
+            f"cycle '{check.cycles[0]}' is not in the warm table, nor is another of these: the "
+            "column cycle names the same cycles in both",
+            file=str(path),
+            column="cycle",
         )
     return check
 
@@ -532,12 +539,6 @@ def _history(args: argparse.Namespace, arm: SerialArm) -> DriftHistory:
     warm = warm_visits(args.warm, arm, cold)
     check = check_visits(args.check, arm, cold, warm)
     shared = [name for name in warm.cycles if name in check.cycles]
-    if not shared:
-        raise InputError(
-            f"no cycle of {args.warm} is here: the column cycle names the same cycles in both",
-            file=str(args.check),
-            column="cycle",
-        )
     return DriftHistory.of(
         spots,
         [warm.of_cycle(name).data for name in shared],

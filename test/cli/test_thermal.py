@@ -146,6 +146,7 @@ BAD = [
     ({"cold": "none.csv"}, [], 2, "BAD_INPUT", "no such table"),
     ({"warm": "check.csv"}, ["--check", "warm.csv"], 0, "", ""),
     ({}, ["--check", "warm.csv"], 2, "BAD_INPUT", "in the warm table too"),
+    ({}, ["--check", "judges.csv"], 2, "BAD_INPUT", "cycle '0' is not in the warm table"),
     ({}, ["--data", "one.csv"], 2, "BAD_INPUT", "flange-sensor"),
     ({}, ["--method", "subset"], 2, "BAD_INPUT", "belong together"),
     ({}, ["--method", "subset", "--parameters", "d9_mm"], 2, "BAD_INPUT", "d9_mm"),
