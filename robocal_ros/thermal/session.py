@@ -136,7 +136,7 @@ class ThermalSession(SessionBase):
             self.desk.add_joints(sample)
             if self.desk.jumps > jumps:  # what an earlier clock stamped cannot be compared any more
                 self.temperatures = MotorTemperatures(self.nominal.joint_names)
-                self.cycle.begun_ns = sample.stamp_ns
+                self.cycle.begun_ns, self.cycle.postponed_ns = sample.stamp_ns, 0
                 with suppress(RobocalError):  # said by `accuracy`
                     if self.follower is not None:
                         self.follower.clock_jumped(left_ns, sample.stamp_ns)

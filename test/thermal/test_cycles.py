@@ -417,8 +417,16 @@ def test_accuracy_is_told_at_any_stamp(cell, hours):
     assert (found.error.rms_m == pytest.approx(scatter_m)) == (hours == 0.0)
 
 
-def test_an_open_cycle_times_out_after_a_jump_back_too(cell):
+@pytest.mark.parametrize("disk_was_full", [False, True])
+def test_an_open_cycle_times_out_after_a_jump_back_too(cell, disk_was_full):
     cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    if disk_was_full:
+        cell.visit(0.0)
+        path = cell.history.path
+        path.rename(path.with_suffix(".away"))
+        cell.session.submit(events.Command(events.END_CYCLE, {"cycle_id": "c1"}))
+        assert cell.session.advance(wall_ns=1, force=True)[-1].status is Code.STORAGE_FAILED
+        path.with_suffix(".away").rename(path)
     cell.shift.now_ns -= 500 * NS
     cell.visit(0.0, slice(2))
     cell.idle(61.0)
