@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from typing import Any
 
+from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import (
     ConditionReachedException,
@@ -33,6 +34,9 @@ OF_NODE = {WAITABLE: "waitables"} | PLAIN
 # What of rclpy's executor is used here beside its interface.
 NEEDED = ["_tasks", "_tasks_lock", "_is_shutdown", "_sigint_gc", "_wakes", "_make_handler"]
 NEEDED += [f"_take_{kind}" for kind in OF_NODE]
+# A node has one or two QoS events of each publisher and subscription, and hardly ever one comes:
+# where it is busy they are looked for so often. They last until they are taken.
+EVENTS_NS = 100_000_000
 
 Entity = Any
 Ready = tuple[str, Entity, Node]
@@ -57,6 +61,7 @@ class _WaitSet:
         self._entities: dict[str, dict[int, tuple[Entity, Node | None]]] = {k: {} for k in PLAIN}
         self._handles: dict[str, list[Any]] = {kind: [] for kind in PLAIN}
         self._waitables: list[tuple[Entity, Node]] = []
+        self._events: list[tuple[Entity, Node]] = []
         context = executor.context.handle
         with ExitStack() as held:
             held.enter_context(context)
@@ -67,12 +72,14 @@ class _WaitSet:
                 for waitable in list(node.waitables):
                     with suppress(InvalidHandle):  # destroyed, by another thread
                         held.enter_context(waitable)
-                        self._waitables.append((waitable, node))
+                        rare = type(waitable) is EventHandler
+                        (self._events if rare else self._waitables).append((waitable, node))
             for guard in (executor._wakes, executor._sigint_gc):
                 if guard is None:
                     raise ShutdownException
                 self._hold(held, GUARD, guard, None)
-            counts = [waitable.get_num_entities() for waitable, _ in self._waitables]
+            each = [*self._waitables, *self._events]
+            counts = [waitable.get_num_entities() for waitable, _ in each]
             own = {kind: len(handles) for kind, handles in self._handles.items()}
             self._set = _rclpy.WaitSet(
                 own["subscription"] + sum(count.num_subscriptions for count in counts),
@@ -96,8 +103,8 @@ class _WaitSet:
         """What was to be destroyed meanwhile is destroyed now."""
         self._held.close()
 
-    def fill(self) -> None:
-        """Name all of it, which each wait forgets.
+    def wait(self, timeout_ns: int, *, events: bool) -> list[Ready]:
+        """Wait for any of it, QoS ``events`` too or not; what is ready. Negative: without an end.
 
         Raises ``InvalidHandle`` where another thread is destroying some of it.
         """
@@ -109,15 +116,13 @@ class _WaitSet:
             add = getattr(self._set, f"add_{kind}")
             for handle in handles:
                 add(handle)
-        for waitable, _ in self._waitables:
+        waitables = [*self._waitables, *self._events] if events else self._waitables
+        for waitable, _ in waitables:
             waitable.add_to_wait_set(self._set)
-
-    def wait(self, timeout_ns: int) -> list[Ready]:
-        """Wait for any of it; what is ready. Negative: without an end."""
         self._set.wait(timeout_ns)
         ready: list[Ready] = [
             (WAITABLE, waitable, node)
-            for waitable, node in self._waitables
+            for waitable, node in waitables
             if waitable.is_ready(self._set)
         ]
         for kind, entities in self._entities.items():
@@ -144,6 +149,7 @@ class OneThreadExecutor(SingleThreadedExecutor):
 
     turn = 0  # number of the callback that runs
     _made_in = 0  # the thread that makes a handler
+    _events_ns = 0  # when QoS events are looked for again
     _tasks: list[Any]  # rclpy's
 
     def __init__(self, **options: Any) -> None:
@@ -262,6 +268,13 @@ class OneThreadExecutor(SingleThreadedExecutor):
             return list(self._tasks)
 
     def _ready(self, timeout_ns: int) -> list[Ready]:
+        """What is ready; nothing, where QoS events are to be looked for before the time is over."""
+        until_events_ns = self._events_ns - time.monotonic_ns()
+        events = until_events_ns <= 0
+        if events:
+            self._events_ns = time.monotonic_ns() + EVENTS_NS
+        elif not 0 <= timeout_ns <= until_events_ns:
+            timeout_ns = until_events_ns
         with self._lock:
             self._waits = True  # from here on this thread alone lets go
             kept = self._kept
@@ -270,8 +283,7 @@ class OneThreadExecutor(SingleThreadedExecutor):
         try:
             if kept is None:
                 kept = self._kept = _WaitSet(self)
-            kept.fill()
-            ready = kept.wait(timeout_ns)
+            ready = kept.wait(timeout_ns, events=events)
         except InvalidHandle:  # another thread is destroying some of it, and then wakes this one
             self._stale, ready = True, []
         finally:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from conftest import DISCOVERY_S
 from rclpy.action import ActionClient, ActionServer, GoalResponse
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
@@ -29,13 +30,24 @@ def test_a_callback_does_not_wake_its_executor(graph: Any, monkeypatch: Any) -> 
     graph.spin_until(lambda: node.inputs["number"].received)
     kept, waited = graph.executor._kept, []
     wait = kept.wait
-    monkeypatch.setattr(kept, "wait", lambda *given: waited.append(1) or wait(*given))
+    monkeypatch.setattr(kept, "wait", lambda *of, **how: waited.append(1) or wait(*of, **how))
     node._diagnostics._timer.cancel()  # nothing else is to come
+    graph.executor._events_ns = 0  # so that this wait is for QoS events too, and lasts
     begin_s = time.monotonic()
     graph.executor.spin_once(timeout_sec=0.05)
     assert len(waited) == 1
     assert time.monotonic() - begin_s > 0.04
     assert graph.executor._kept is kept
+
+
+def test_events_of_qos_come_while_messages_keep_it_busy(graph: Any) -> None:
+    node, matched = graph.add(Doubler), []
+    node.create_timer(1e-3, lambda: None)
+    told = SubscriptionEventCallbacks(matched=matched.append)
+    node.create_subscription(Float64, "/told", lambda _: None, ALL, event_callbacks=told)
+    for count in (1, 2):
+        graph.publisher(Float64, "/told")
+        graph.spin_until(lambda n=count: len(matched) == n, "the event")
 
 
 def test_a_callback_that_awaited_something_wakes_its_executor(graph: Any, monkeypatch: Any) -> None:
