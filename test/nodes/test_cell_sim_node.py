@@ -412,15 +412,16 @@ def test_the_whole_cell_shows_its_spheres_and_temperatures(graph):
     cell = WholeCell(graph, cloud_points=300, gears=True)
     cell.go(poses("cycle")[0], 1.5)
     cell.wait_for("sphere_cloud", 2)
-    cloud = cell.told["sphere_cloud"][1]  # of the first the drives may still be settling
+    cloud = cell.told["sphere_cloud"][0]
     ball = cloud_sample(cloud, SphereRule(0.01905))
     assert (ball.frame, ball.target) == ("sensor", "ball")
     sphere = cell.node._cell.plan.sphere
-    T = sphere.sensor.T_sensor_base @ cell.node._cell.flange(np.array([cell.node._cell.now_s]))[0]
+    seen_s = 1e-9 * (ball.stamp_ns - cell.node._origin_ns)  # the drives may settle still
+    T = sphere.sensor.T_sensor_base @ cell.node._cell.flange(np.array([seen_s]))[0]
     centre = (T @ np.append(sphere.sensor.ball, 1.0))[:3]
     assert ball.position_m == pytest.approx(centre, abs=2e-4)
-    cell.wait_for("reference_sphere_center", 2)
-    floor = cell.told["reference_sphere_center"][1]
+    cell.wait_for("reference_sphere_center", 1)
+    floor = cell.told["reference_sphere_center"][0]
     assert floor.header.frame_id == "sensor/floor"
     assert floor.header.stamp == cloud.header.stamp
     assert [floor.point.x, floor.point.y, floor.point.z] == pytest.approx(sphere.floor, abs=1e-4)
